@@ -18,7 +18,7 @@ from backends_programmes import casadi_exact, osqp_linear
 from backends_star import Job, one_by_one, stars
 from timing import report, timed
 
-from coopoc.optimize.starts.initial import converted
+from coopoc.optimize.starts.initial import as_vectors
 
 ROUNDS, RUNS = 7, 200
 
@@ -26,7 +26,10 @@ ROUNDS, RUNS = 7, 200
 def jobs(runs: int = RUNS) -> list[Job]:
     """All of them; a call of each has run once."""
     exact = stars(runs)
-    linear = [converted(star) for star in exact]
+    linear = [
+        star.replace_unchecked(factors=tuple(as_vectors(f) if f.kind == "spherical" else f for f in star.factors))
+        for star in exact
+    ]
     return [
         gtsam_linear(linear),
         casadi_exact(exact),

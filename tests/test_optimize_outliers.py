@@ -76,9 +76,8 @@ def test_predictions_are_those_of_dense_algebra():
     """Oracle: the inverse of J^T J of the known inliers by NumPy."""
     problem = replace(from_graph(drive(1, steps=150, loops=20)[0], start="odometry"), fixed=(75,))
     (candidate,) = loop_closures(problem)
-    marked = mark(problem, [candidate])
     x = np.asarray(problem.x0)
-    distance, spread = predicted(problem, marked, np.zeros(len(candidate[1])), x)
+    distance, spread = predicted(mark(problem, [candidate]), np.zeros(len(candidate[1])), x)
     linear = problem.linearise(x)
     whole = problem.jacobian(linear).toarray()
     size = problem.factors[0].size

@@ -18,7 +18,7 @@ from coopoc.optimize.descent.levenberg_marquardt import Arrival, arrive
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
-from coopoc.optimize.starts.graph_starts import Moves, tree, unwound, walk
+from coopoc.optimize.starts.graph_starts import tree, unwound, walk
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from unseen_graphs import ranged_drives, world
@@ -166,13 +166,11 @@ def test_small_drives_end_as_low_as_restarts_or_say_so():
 
 
 def test_a_walk_counts_beyond_what_32_bits_hold():
-    """Key a n + b of a pair in a graph of 50,000 poses; against the line that is driven."""
-    n, d = 50_000, 2
-    chain = np.c_[np.arange(n - 1), np.arange(1, n)]
-    moves = Moves(chain, np.tile([1.0, 0.0], (n - 1, 1)), np.tile(np.eye(d), (n - 1, 1, 1)), np.ones(n - 1))
-    position, _, known = walk(n, d, moves, [(0, np.zeros(d), np.eye(d))])
+    """Key a n + b of a pair in a graph of 50,000 poses; against the steps of 1 m of the ring that is driven."""
+    n = 50_000
+    position, _, known = walk(ring(n, 0.0), np.ones(n, bool), [(0, np.zeros(2), np.eye(2))])
     assert known.all()
-    assert np.allclose(position[:, 0], np.arange(n))
+    assert np.allclose(np.linalg.norm(np.diff(position, axis=0), axis=1), 1.0)
 
 
 def ring(n: int, wrong: float) -> Graph:

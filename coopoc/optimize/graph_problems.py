@@ -1,5 +1,6 @@
 """A graph of poses and landmarks as a Problem, and where to start it."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -84,9 +85,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     load(*LIBRARIES)
     began, notes, factors = clock(), _counted(graph.notes), _factors(graph, objective)
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
-    first = "odometry" if start == "incremental" else start
-    names = contenders(graph) if start == "auto" else (first,)
-    start_x = _x0(graph, poses, "odometry" if start == "auto" else first)
+    first = "odometry" if start in ("auto", "incremental") else start
+    start_x = _x0(graph, poses, first)
     problem = Problem(graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
         notes = (
@@ -96,9 +96,10 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     if graph.dimension == 2 and (beyond := int((np.abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
         notes = *notes, f"relative poses beyond two turns, {beyond} in all: are angles in degrees?"
-    won = Search(names[0])
+    won = Search(first)
     if start == "auto":
-        starts = {name: partial(_x0, graph, poses, name) for name in names} | {"odometry": lambda: start_x}
+        starts = {name: partial(_x0, graph, poses, name) for name in contenders(graph)}
+        starts["odometry"] = lambda: start_x
         problem, won = _raced(graph, problem, starts, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
@@ -150,12 +151,11 @@ def _counted(notes: Sequence[str]) -> tuple[str, ...]:
     >>> _counted(["line 1: was repaired", "line 2: was repaired"])
     ('2 times, first in line 1: was repaired',)
     """
-    places: dict[str, list[str]] = {}
+    first = dict[str, str]()
     for note in notes:
-        location, _, what = note.rpartition(": ")
-        places.setdefault(what, []).append(location)
-    first = {what: f"{own[0]}: {what}" if own[0] else what for what, own in places.items()}
-    return tuple(f"{n} times, first in {first[w]}" if (n := len(own)) > 1 else first[w] for w, own in places.items())
+        first.setdefault(note.rpartition(": ")[2], note)
+    count = Counter(note.rpartition(": ")[2] for note in notes)
+    return tuple(f"{count[what]} times, first in {note}" if count[what] > 1 else note for what, note in first.items())
 
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
@@ -227,10 +227,8 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
 def _fixed(graph: Graph) -> tuple[int, ...]:
     """The fixed vertices, and the first pose of each part of the graph that has neither those nor priors."""
     edges = (graph.relative_pose, graph.relative_point, graph.ranges)
-    part = parts(len(graph.names), *(each.nodes for each in edges if len(each)))
-    held = [graph.fixed, *(each.nodes[:, 0] for each in (graph.pose_prior, graph.point_prior) if len(each))]
-    holding = np.zeros(len(part), dtype=bool)
-    holding[part[np.concatenate(held)]] = True
-    free = np.flatnonzero(graph.is_pose & ~holding[part])
+    part = parts(len(graph.names), *(each.nodes for each in edges))
+    held = np.concatenate([graph.fixed, graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])
+    free = np.flatnonzero(graph.is_pose & ~np.isin(part, part[held]))
     first = free[np.unique(part[free], return_index=True)[1]]
     return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, instance, number
+from ..arrays import Floats, checked, instance, number
 from ..errors import InputError, require
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
-from .model.factor import Factor, unchecked
-from .model.inputs import numbers
-from .model.problem import Problem, check_item, indices, no_such_node, points, rows
+from .model.factor import Factor, fused, stacked, unchecked
+from .model.problem import Problem, indices, no_such_node, points, rows
 from .solution import Solution
 from .solve import solve
 from .starts.initial import initial_guess
@@ -60,7 +59,7 @@ class Incremental:
         for k, (name, value) in enumerate(new.items()):
             if name in self._place:
                 raise InputError("values", repr(name), "must be a new node", "Give guesses of new nodes alone.")
-            vector = numbers("values", value).ravel()
+            vector = checked("values", value).ravel()
             if len(vector) not in (d, space.ambient):
                 allowed = f"must be {d} numbers of a point or {space.ambient} of a pose"
                 raise InputError("values", f"{name}: {len(vector)} numbers", allowed, "Make poses with coopoc.pose.")
@@ -82,17 +81,15 @@ class Incremental:
                 at = indices(index, kind, nodes)
                 each = Factor(kind, at, rows(kind, z, len(at)), *std)
             made.append(each)
-        used = np.unique(np.concatenate([np.empty(0, np.int64), *(f.nodes.ravel() for f in made)])).tolist()
-        turning = [node in self._poses or (node >= first and turns[index(node) - first]) for node in used]
-        poses, late = tuple(np.flatnonzero(turning).tolist()), [*new]
+        used, late = np.unique(stacked(f.nodes.ravel() for f in made)).tolist(), [*new]
         names = [self.names[k] if k < first else late[k - first] for k in map(index, used)]
+        late_poses = {first + k for k, turned in enumerate(turns) if turned}
+        poses = [k for k, node in enumerate(used) if node in self._poses or node in late_poses]
         local = [unchecked(f, nodes=np.searchsorted(used, f.nodes)) for f in made]
-        for factor in local:
-            check_item(factor, names, frozenset(poses), d)
-        part = unchecked(self._problem, names=tuple(names), factors=tuple(local), poses=poses, fixed=())
+        part = Problem(tuple(names), local, dimension=d, poses=tuple(poses))
         part.__dict__["space"] = space
         self._step(part, used, first, x, turns)
-        self._poses.update(first + k for k, turned in enumerate(turns) if turned)
+        self._poses |= late_poses
         self._place.update(fresh)
         self.names += new
         self._factors += made
@@ -155,21 +152,9 @@ class Incremental:
     @property
     def problem(self) -> Problem:
         """All measurements so far, from iSAM2's estimate."""
-        x, kinds = self.x, dict[Any, list[Factor]]()
-        for factor in self._factors:
-            kinds.setdefault((factor.kind, factor.loss, np.asarray(factor.constants).shape[1:]), []).append(factor)
-        joined = [
-            unchecked(
-                own[0],
-                **{name: np.concatenate([getattr(f, name) for f in own]) for name in ("nodes", "z", "constants")},
-                std=None,
-                sqrt_information=np.concatenate([np.broadcast_to(f.root, (len(f.nodes), f.size, f.size)) for f in own]),
-            )
-            for own in kinds.values()
-        ]
-        x[list(self._problem.fixed)] = initial_guess(self._problem)[list(self._problem.fixed)]
-        poses = tuple(sorted(self._poses))
-        return replace(self._problem, names=tuple(self.names), factors=tuple(joined), x0=x, poses=poses)
+        x, fixed, poses = self.x, list(self._problem.fixed), tuple(sorted(self._poses))
+        x[fixed] = initial_guess(self._problem)[fixed]
+        return replace(self._problem, names=tuple(self.names), factors=fused(self._factors), x0=x, poses=poses)
 
     def update(self, throw: bool = False, **options: Any) -> Solution:
         """`solve` of all measurements so far from iSAM2's estimate, with its statuses and notes.

@@ -15,7 +15,7 @@ from .assess.assess import Assessment, assess, is_constrained_minimum, judged, n
 from .backend import MAX_ITERATIONS, Backend, Options, require_backend
 from .graph_problems import started
 from .model.factor import fused
-from .model.measurements import is_converted
+from .model.measurements import CONVERTED
 from .model.problem import Problem
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
@@ -98,7 +98,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     began = clock()
     solver, problem = backend.solver(problem, options), started(problem)
     start, placed = _start(problem)
-    whole = placed and all(f.measurement.linear or is_converted(f.measurement) for f in problem.factors)
+    whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
     if problem.x0 is None and not whole and not problem.constraints:
         problem = _searched(problem, start)
         assert problem.x0 is not None
@@ -112,9 +112,10 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     solved = clock()
     x, iterations, infeasible = result.x, result.iterations, result.infeasible
     truth = assess(problem, x, covariance)
-    out = truth.active is not None and (truth.violation > FEASIBLE or infeasible)
-    violated = {"violated": truth.active.violated} if truth.active is not None and out else {}
     status = Status.INFEASIBLE if infeasible else _status(problem, x, truth)
+    extras = result.extras | (search.extras if search.start else {})
+    if truth.active is not None and status is Status.INFEASIBLE:
+        extras["violated"] = truth.active.violated
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
     expected, notes = judged(problem, x, truth)
@@ -138,7 +139,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         violation=truth.violation,
         expected=expected,
         notes=(*(note for note in search.notes if not truth.unobservable or note != ELSEWHERE), *notes),
-        extras=result.extras | violated | (search.extras if search.start else {}),
+        extras=extras,
     )
 
 
@@ -168,9 +169,7 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
     with np.errstate(all="ignore"):
         linear = problem.linearise(start)
     for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
-        bad = ~np.isfinite(residual).all(axis=1)
-        for by_node in jacobian:
-            bad = bad | ~np.isfinite(by_node).all(axis=(1, 2))
+        bad = ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=(1, 2))
         if bad.any():
             raise _without_direction(problem, factor.kind, factor.nodes[np.flatnonzero(bad)[0]])
     if problem.constraints:

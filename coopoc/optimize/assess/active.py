@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.derivatives import linearise
-from ..model.factor import as_factor, bounded
+from ..model.factor import as_factor, bounded, stacked
 from ..model.problem import Problem
 
 NEAR = 5e-7
@@ -36,9 +35,15 @@ class Rows:
     origin: Ints
 
     @property
+    def sides(self) -> tuple[Floats, Floats]:
+        """(rows,) bounds of what a step may add to each."""
+        return self.lower - self.value, self.upper - self.value
+
+    @property
     def outside(self) -> Floats:
         """(rows,) by how much each is violated."""
-        return np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0.0)
+        low, high = self.sides
+        return np.maximum(np.maximum(low, -high), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,26 +77,15 @@ class Active:
 
 def constraint_rows(problem: Problem, x: Floats) -> Rows:
     """The constraints of a problem at x (n, ambient)."""
-    from scipy.sparse import vstack
-
-    parts = [_rows_of(problem, x, k) for k in range(len(problem.constraints))]
-    value, lower, upper = (np.concatenate([p[0][side] for p in parts]) for side in range(3))
-    return Rows(value, lower, upper, vstack([p[1] for p in parts], format="csr"), np.concatenate([p[2] for p in parts]))
-
-
-def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats, Floats], Any, Ints]:
-    from scipy.sparse import csr_array
-
-    item, space = problem.constraints[k], problem.space
-    finite = bounded(item)
-    linear = linearise(space, [as_factor(item)], problem.movable, x)
-    row, component = np.nonzero(finite)
-    data = np.stack([jacobian[row, component] for jacobian in linear.jacobian[0]], axis=1)
-    columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
-    starts = np.arange(0, data.size + 1, item.nodes.shape[1] * space.dof)
-    matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
-    index = np.stack([np.full(len(row), k), row, component], axis=1)
-    return (linear.residual[0][finite], item.lower[finite], item.upper[finite]), matrix, index
+    items = problem.constraints
+    part = problem.replace_unchecked(factors=tuple(map(as_factor, items)))
+    linear, finite = part.linearise(x), np.concatenate([bounded(item).ravel() for item in items])
+    value, lower, upper = (
+        np.concatenate([side.ravel() for side in sides])[finite]
+        for sides in (linear.residual, [item.lower for item in items], [item.upper for item in items])
+    )
+    origin = [np.insert(np.argwhere(bounded(item)), 0, k, axis=1) for k, item in enumerate(items)]
+    return Rows(value, lower, upper, part.jacobian(linear)[finite], np.concatenate(origin))
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
@@ -160,7 +154,7 @@ def _directions(size: int, blocks: list[tuple[Ints, Floats]]) -> Any:
     """(size, k) sparse: the blocks' directions on their columns, and each coordinate that is in no block."""
     from scipy.sparse import block_diag, eye_array
 
-    own = np.concatenate([np.empty(0, np.int64), *(columns for columns, _ in blocks)])
+    own = stacked(columns for columns, _ in blocks)
     rest = np.setdiff1d(np.arange(size), own)
     whole = block_diag([*(block for _, block in blocks), eye_array(len(rest))], format="csr")
     return whole[np.argsort(np.concatenate([own, rest]))].tocsc()

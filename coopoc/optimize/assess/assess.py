@@ -11,7 +11,7 @@ from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
 from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
 from ..model.derivatives import linearise, numbers_of
-from ..model.factor import Factor, as_factor, unchecked
+from ..model.factor import Factor, as_factor, reweighed, unchecked
 from ..model.problem import Problem, several
 from .active import Active, active_at, constraint_rows
 
@@ -319,8 +319,7 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     for k, (item, term) in enumerate(zip(problem.constraints, structure.constraints, strict=True)):
         own, weight = rows[:, 0] == k, np.zeros(item.lower.shape)
         weight[rows[own, 1], rows[own, 2]] = active.multipliers[own]
-        with np.errstate(divide="ignore"):
-            numbers.append(numbers_of(unchecked(as_factor(item), std=1.0 / weight)))
+        numbers.append(numbers_of(reweighed(as_factor(item), weight)))
         terms.append(term._replace(kind=term.kind._replace(bound=True)))
     layout = shared_layout(structure._replace(factors=tuple(terms), constraints=()))
     entries, size = layout.entries, system.size
@@ -338,9 +337,8 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     Measurements that a robust loss rejects count neither in the cost nor in what is expected. Where inequalities push,
     the cost is no more than that of the truth, which all that is measured adds to.
     """
-    unknowns = len(x) * problem.space.dof if problem.movable is None else int(np.count_nonzero(problem.movable))
-    robust = [factor for factor in problem.factors if factor.loss is not None]
-    notes, spent, out, pushing, rejected = list[str](), 0.0, 0, 0, list[tuple[str, int, int, str]]()
+    unknowns, notes, rejected = sparse(problem).size, list[str](), list[tuple[str, int, int, str]]()
+    spent, out, pushing = 0.0, 0, 0
     if not np.isfinite(truth.cost):
         return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)
     if truth.curved:
@@ -350,9 +348,10 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     if truth.active is not None:
         free, along, exact = truth.active.along.shape[0], truth.active.along.shape[1], truth.active.exact.shape[1]
         unknowns, pushing = unknowns - free + along, exact - along
-    for factor in robust:
+    for factor in problem.factors:
+        if factor.loss is None:
+            continue
         square = squared(problem, factor, x)
-        assert factor.loss is not None
         beyond = np.asarray(factor.loss.weight(square)) < INLIER_WEIGHT
         spent, out = spent + 0.5 * float(factor.loss.cost(square[beyond]).sum()), out + factor.size * int(beyond.sum())
         if beyond.any():

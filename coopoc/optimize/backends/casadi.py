@@ -17,7 +17,7 @@ from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult
 from ..model.derivatives import Structure, expressions
-from ..model.factor import steerable
+from ..model.factor import stacked, steerable
 from ..model.problem import Problem
 
 DENSE = 200
@@ -127,8 +127,7 @@ def _numbers(problem: Problem, x: Floats) -> Floats:
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
     """Lower and upper sides of the numbers that are bounded and can change."""
     kept = [(c, steerable(c, problem.movable)) for c in problem.constraints]
-    lower, upper = [c.lower[which] for c, which in kept], [c.upper[which] for c, which in kept]
-    return np.concatenate([np.empty(0), *lower]), np.concatenate([np.empty(0), *upper])
+    return stacked(c.lower[which] for c, which in kept), stacked(c.upper[which] for c, which in kept)
 
 
 def _exponential(step: Floats, dimension: int) -> Floats:

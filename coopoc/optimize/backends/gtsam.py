@@ -18,7 +18,7 @@ from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult
 from ..model.derivatives import linearise
 from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
-from ..model.space import Space, exp, log
+from ..model.space import Space, exp
 
 STARTS = 3
 """Times that the optimiser begins where it ended, damped as at first, while it ended damped more; once if linear."""
@@ -75,12 +75,12 @@ class Part(NamedTuple):
 
     Attributes:
         names: of the class, by which of the nodes are poses.
-        arguments: by measurement what the class takes between keys and noise model.
+        arguments: by measurement what the class takes between keys and noise model, to be read once.
         root: (M or 1, k, k) S, square root of the information of its k errors.
     """
 
     names: Names
-    arguments: Callable[[], Iterable[tuple[Any, ...]]]
+    arguments: Iterable[tuple[Any, ...]]
     root: Floats
 
 
@@ -116,8 +116,8 @@ def pose_of(d: int, x: Floats) -> Any:
     return gtsam.Pose3(gtsam.Rot3(x[3:].reshape(3, 3)), x[:3])
 
 
-def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
-    return lambda: ((pose_of(d, each),) for each in x)
+def _poses(d: int, x: Floats) -> Iterable[tuple[Any, ...]]:
+    return ((pose_of(d, each),) for each in x)
 
 
 PLAIN: Mapping[str, Names] = {
@@ -131,7 +131,7 @@ PLAIN: Mapping[str, Names] = {
 def _plain(factor: Factor, W: Floats, d: int) -> Form:
     names = {turning: name.format(d) for turning, name in PLAIN[factor.kind].items()}
     z = factor.z[:, 0] if factor.kind == "range" else factor.z
-    return [Part(names, lambda: zip(z, strict=True), W)]
+    return [Part(names, zip(z, strict=True), W)]
 
 
 def _bearing(factor: Factor, W: Floats, d: int) -> Form:
@@ -139,17 +139,13 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
     In space GTSAM weighs a bearing by its tangent plane, not by azimuth and inclination, and has no forward axis.
     """
+    import gtsam
+
     if d == 3:
         return None
     name = "Bearing" if factor.kind == "bearing" else "BearingRange"
-
-    def arguments() -> Iterable[tuple[Any, ...]]:
-        import gtsam
-
-        return ((gtsam.Rot2(angle), *far) for *far, angle in factor.z)
-
     names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
-    return [Part(names, arguments, W[:, ::-1, ::-1])]
+    return [Part(names, ((gtsam.Rot2(angle), *far) for *far, angle in factor.z), W[:, ::-1, ::-1])]
 
 
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
@@ -198,24 +194,16 @@ def _chord(W: Floats, columns: dict[int, Any], z: Floats, d: int) -> Form:
 def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     if _coupled(W, d):
         return None
-    turned = Space(d, has_rotation=True).rotation(factor.z)
-
-    def rotations() -> Iterable[tuple[Any, ...]]:
-        import gtsam
-
-        return ((gtsam.Rot2(float(log(turn)[0])) if d == 2 else gtsam.Rot3(turn),) for turn in turned)
-
-    root = W[:, :d, :d] @ np.swapaxes(turned, -1, -2)
+    root = W[:, :d, :d] @ np.swapaxes(Space(d, has_rotation=True).rotation(factor.z), -1, -2)
     return [
-        Part({(POSE,): f"PoseTranslationPrior{d}D"}, lambda: zip(factor.z[:, :d], strict=True), root),
-        Part({(POSE,): f"PoseRotationPrior{d}D"}, rotations, W[:, d:, d:]),
+        Part({(POSE,): f"PoseTranslationPrior{d}D"}, zip(factor.z[:, :d], strict=True), root),
+        Part({(POSE,): f"PoseRotationPrior{d}D"}, ((pose_of(d, each).rotation(),) for each in factor.z), W[:, d:, d:]),
     ]
 
 
 def _coupled(W: Floats, d: int) -> bool:
     """Whether position and rotation are correlated."""
-    coupled = max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max())
-    return bool(coupled > SAME * np.abs(W).max())
+    return bool(max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max()) > SAME * np.abs(W).max())
 
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
@@ -282,7 +270,7 @@ def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None
     for factor, form in zip(problem.factors, parts, strict=True):
         for part in form or ():
             models = _models(part.root, factor)
-            for nodes, arguments, model in zip(factor.nodes.tolist(), part.arguments(), models, strict=True):
+            for nodes, arguments, model in zip(factor.nodes.tolist(), part.arguments, models, strict=True):
                 if tuple([posed[i] for i in nodes]) not in part.names:
                     nodes = nodes[::-1]  # such as a range from a point to a pose
                 made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])

@@ -1,7 +1,8 @@
 """osqp: sequential quadratic programming with one workspace per structure, whose values are updated at every step.
 
-Bounds on positions and displacements are rows l - h <= C dx <= u - h of each quadratic programme. The start is first
-moved onto them by the least step; from then on every step keeps them, so that the cost alone decides between steps.
+Bounds on positions and displacements are rows l - h <= C dx <= u - h of each quadratic programme, with one C. The start
+is first moved onto them by the least step; from then on every step keeps them, so that the cost alone decides between
+steps.
 
 Settings matter: OSQP reports "solved" and can be a metre off when odometry weighs 5e5 times as much as GNSS. Scaling is
 off, the tolerance is tight, and every answer is checked against its own KKT conditions and repaired where it fails.
@@ -10,7 +11,6 @@ and 1.6 would make 40 of them out of one), and a repair is further iterations. W
 exactly for the active set that the iterations have found (polishing).
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from threading import get_ident
 from typing import Any
@@ -22,8 +22,6 @@ from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult
 from ..descent.levenberg_marquardt import arrive
-from ..model.derivatives import linearise
-from ..model.factor import as_factor, bounded
 from ..model.problem import Problem
 
 SETTINGS = {
@@ -76,36 +74,34 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     >>> solve(problem.constrain("displacement", ("a", "b"), upper=[7, 9, 9]), "osqp").x.round(3)[:, 0]
     array([1., 8.])
     """
-    limits, layout = None, layout_of(structure)
+    held, layout = None, layout_of(structure)
     if structure.constraints:
         from scipy.sparse import csc_matrix
 
         rows = constraint_rows(structure, np.zeros((len(structure.names), structure.space.ambient)))
-        limits = _Limits(structure, csc_matrix(rows.matrix), rows.lower, rows.upper)
-    moving = np.flatnonzero(layout.entries.number.ravel() >= 0)
-    held = Programme(_pattern(layout), limits.matrix[:, moving]) if limits else None
+        held = Programme(_pattern(layout), csc_matrix(rows.matrix)[:, layout.entries.number.ravel() >= 0])
 
     def solver(problem: Problem, start: Floats) -> SolverResult:
         system, x = sparse(problem), start
         programme = held or unbounded(layout, get_ident())
         programme.counts.update(osqp_iterations=0, repairs=0)
-        if limits:
+        if held:
             try:
-                x, feasible = _nearest(limits, start)
+                x, feasible = _nearest(structure, start)
             except np.linalg.LinAlgError:
                 return SolverResult(x, 0, extras=dict(programme.counts))
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
 
         def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
-            sides = limits.around(x) if limits else (np.empty(0), np.empty(0))
+            sides = constraint_rows(structure, x).sides if held else (np.empty(0), np.empty(0))
             try:
                 return programme.solve(values, gradient, *sides) if system.cholesky.factor(values) else None
             except np.linalg.LinAlgError:
                 return None
 
         end = arrive(
-            system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, bool(limits)
+            system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, bool(held)
         )
         return SolverResult(end.x, end.iterations, extras=dict(programme.counts))
 
@@ -209,43 +205,22 @@ def unbounded(layout: Layout, thread: int) -> Programme:
     return programme
 
 
-@dataclass(frozen=True, eq=False)
-class _Limits:
-    """The constraints as rows lower - h(x) <= C dx <= upper - h(x): h is linear, C the same everywhere."""
-
-    problem: Problem
-    matrix: Any
-    lower: Floats
-    upper: Floats
-
-    def around(self, x: Floats) -> tuple[Floats, Floats]:
-        """Bounds of C dx at x (n, ambient)."""
-        space, constraints = self.problem.space, self.problem.constraints
-        linear = linearise(space, [as_factor(c) for c in constraints], None, x)
-        parts = [h[bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
-        value = np.concatenate([np.empty(0), *parts])
-        return self.lower - value, self.upper - value
-
-
-def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:
+def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     """x moved by the least step that satisfies the constraints and True; if there is none, by a step that violates them
     least, and False."""
     from scipy.sparse import csc_matrix, diags, eye, hstack
 
-    lower, upper = limits.around(x)
-    if np.all(lower <= 0) and np.all(upper >= 0):
+    rows = constraint_rows(problem, x)
+    if not rows.outside.any():
         return x, True
-    space, (rows, size) = limits.problem.space, limits.matrix.shape
+    matrix, weight, feasible = csc_matrix(rows.matrix), np.ones(rows.matrix.shape[1]), True
     try:
-        programme = Programme(eye(size, format="csc"), limits.matrix)
-        return space.retract(
-            x, programme.solve(np.ones(size), np.zeros(size), lower, upper)[0].reshape(len(x), -1)
-        ), True
+        step, _ = Programme(diags(weight, format="csc"), matrix).solve(weight, 0.0 * weight, *rows.sides)
     except Infeasible:
-        slack, weight = csc_matrix(hstack([limits.matrix, eye(rows)])), np.repeat([FAR, 1.0], [size, rows])
-        programme = Programme(diags(weight, format="csc"), slack)
-        step = programme.solve(weight, np.zeros(size + rows), lower, upper)[0][:size]
-        return space.retract(x, step.reshape(len(x), -1)), False
+        slack, feasible = csc_matrix(hstack([matrix, eye(len(rows.value))])), False
+        weight = np.concatenate([FAR * weight, np.ones(len(rows.value))])
+        step, _ = Programme(diags(weight, format="csc"), slack).solve(weight, 0.0 * weight, *rows.sides)
+    return problem.space.retract(x, step[: matrix.shape[1]].reshape(len(x), -1)), feasible
 
 
 BACKEND = Backend(

@@ -4,6 +4,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..algebra.cholesky import cholesky_of, columns_solved
+from ..model.factor import stacked
 from ..model.problem import Problem
 from ..starts.graph_starts import parts
 from .qcqp import TERMS, quadratic
@@ -83,6 +84,6 @@ def _anchors(problem: Problem) -> Ints:
     """One pose of each part of the problem that nothing joins to the world or, linearly, to another."""
     linear = [factor.nodes for factor in problem.factors if factor.kind in RELAXED]
     part = parts(len(problem.names), *(n for n in linear if n.shape[1] == 2))
-    held = part[np.concatenate([np.empty(0, np.int64), *(n[:, 0] for n in linear if n.shape[1] == 1)])]
+    held = part[stacked(n[:, 0] for n in linear if n.shape[1] == 1)]
     poses = np.setdiff1d(problem.poses, np.flatnonzero(np.isin(part, held)))
     return poses[np.unique(part[poses], return_index=True)[1]]

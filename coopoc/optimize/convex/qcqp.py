@@ -20,7 +20,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ...errors import InputError
-from ..model.factor import Factor
+from ..model.factor import Factor, stacked
 from ..model.problem import Problem
 from ..model.space import nearest_rotation
 
@@ -124,15 +124,6 @@ class Multipliers:
         """1/2 trace is a lower bound if C - L is positive semidefinite."""
         return float(np.einsum("nii->", self.stiefel) + self.sphere.sum())
 
-    @property
-    def dense(self) -> Floats:
-        """L (bound, bound)."""
-        stiefel, sphere = self.problem.stiefel, self.problem.sphere
-        out = np.zeros((self.problem.bound,) * 2)
-        out[stiefel[:, :, None], stiefel[:, None, :]] = self.stiefel
-        out[sphere, sphere] = self.sphere[:, None]
-        return out
-
     @cached_property
     def matrix(self) -> Any:
         """L (bound, bound), sparse."""
@@ -180,7 +171,7 @@ def quadratic(problem: Problem) -> Quadratic:
         _refuse(uneven[0])
     fixes = [f.z[:, :d] for f in world if f.kind != "displacement"]
     origin = np.concatenate(fixes).mean(axis=0) if fixes else np.zeros(d)
-    edges = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes for f in problem.factors if f.kind == "range")])
+    edges = stacked((f.nodes for f in problem.factors if f.kind == "range"), 2)
     rows = _Rows(problem, bool(uneven), bool(world or problem.fixed), len(edges), origin)
     for factor in problem.factors:
         TERMS[factor.kind](rows, factor)

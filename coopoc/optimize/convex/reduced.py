@@ -114,7 +114,7 @@ class Reduced:
 
         size = self.problem.bound
         if size <= DENSE:
-            return np.linalg.eigvalsh(self.matrix - L.dense)[:count]
+            return np.linalg.eigvalsh(self.matrix - L.matrix.toarray())[:count]
         less, shift, factored, rest = L.matrix, -1e-7 * self.scale, None, self.gram.shape[0] - size
         while factored is None:  # the Schur complement of this matrix is C - less - shift I
             shift *= 10.0

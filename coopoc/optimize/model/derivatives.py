@@ -7,6 +7,7 @@ which the kernel in kernels/graphs/graph_tape.py runs for all measurements.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations_with_replacement
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -14,8 +15,8 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError, require
-from .factor import LOSSES, Factor, Loss
-from .measurements import Measurement, converted_rows, is_converted
+from .factor import LOSSES, Factor, Loss, stacked
+from .measurements import CONVERTED, Measurement, converted_rows
 from .space import Space
 
 if TYPE_CHECKING:
@@ -97,12 +98,8 @@ class Structure(NamedTuple):
 
 def numbers_of(factor: Factor) -> Floats:
     """(P, M) z, constants and weights of the measurements of a factor."""
-    weight = factor.sqrt_information
-    if factor.std is not None:
-        weight = 1.0 / factor.std
-    else:
-        assert weight is not None
-        weight = weight.reshape(len(weight), -1)
+    weight = np.asarray(factor.sqrt_information) if factor.std is None else 1.0 / factor.std
+    weight = weight.reshape(len(weight), -1)
     assert factor.constants is not None
     first, second = factor.z.shape[-1], factor.z.shape[-1] + factor.constants.shape[1]
     out = np.empty((second + weight.shape[-1], len(factor.nodes)))
@@ -147,7 +144,7 @@ def residual_of(kind: Kind, converted: bool = False) -> Residual:
         for k in range(arity)
     ]
     z, assumed, weight = numbers[:z_width], numbers[z_width : z_width + constants], numbers[z_width + constants :]
-    vectors = converted and is_converted(measurement)
+    vectors = converted and measurement.name == CONVERTED
     try:
         local = _local(measurement, places)
         gap = _converted(local, z) if vectors else _wrapped(measurement, local, z, assumed, space.dimension)
@@ -303,28 +300,19 @@ def write(kind: Kind, model: Model) -> Written:
     square = ca.SX.sym("square")
     rho = robust(square, kind.loss)
     cost = ca.sum1(white) if kind.bound else 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
-    zero = ca.SX.zeros(steps.size1())
-    outputs, entries = [cost], [(-1, -1)]
+    J, outputs, entries = ca.jacobian(white, steps), [cost], [(-1, -1)]
     if model == "jacobian":
-        whole = ca.horzcat(white, ca.jacobian(white, steps))
+        whole = ca.horzcat(white, J)
         entries = [(i, j - 1) for i in range(whole.size1()) for j in range(whole.size2())]
         outputs = [whole[i, j + 1] for i, j in entries]
     elif model != "cost":
-        gradient = ca.gradient(cost, steps)
+        curvature = ca.mtimes(J.T, J) * ca.substitute(ca.jacobian(rho, square), square, ca.sumsqr(white))
         if model == "newton":
             curvature = ca.hessian(cost, steps)[0]
-        else:
-            J = ca.jacobian(white, steps)
-            curvature = ca.mtimes(J.T, J) * ca.substitute(ca.jacobian(rho, square), square, ca.sumsqr(white))
-        for i in range(steps.size1()):
-            outputs.append(gradient[i])
-            entries.append((i, -1))
-        for i in range(steps.size1()):
-            for j in range(i, steps.size1()):
-                outputs.append(curvature[i, j])
-                entries.append((i, j))
-    here = ca.substitute(ca.vertcat(*outputs), steps, zero)
-    here = ca.cse(here)
+        upper = [*combinations_with_replacement(range(steps.size1()), 2)]
+        outputs += [*ca.vertsplit(ca.gradient(cost, steps)), *(curvature[i, j] for i, j in upper)]
+        entries += [*((i, -1) for i in range(steps.size1())), *upper]
+    here = ca.cse(ca.substitute(ca.vertcat(*outputs), steps, ca.SX.zeros(steps.size1())))
     kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
     together = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
     tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], together), kind.measurement.name)
@@ -376,13 +364,11 @@ class Linear:
     A robust factor's residual and derivatives carry the root of its weight rho'.
 
     Args:
-        x: (n, ambient).
         residual: per factor (M, size).
         jacobian: per factor and node (M, size, dof).
         cost: 1/2 sum of rho.
     """
 
-    x: Floats
     residual: tuple[Floats, ...]
     jacobian: tuple[tuple[Floats, ...], ...]
     cost: float
@@ -404,7 +390,7 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
             jacobian = tuple(s * movable[n][:, None] for s, n in zip(jacobian, factor.nodes.T, strict=True))
         residuals.append(residual)
         jacobians.append(jacobian)
-    return Linear(x, tuple(residuals), tuple(jacobians), cost)
+    return Linear(tuple(residuals), tuple(jacobians), cost)
 
 
 def _evaluated(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
@@ -434,7 +420,7 @@ def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int,
     from scipy.sparse import csr_array
 
     (n, dof), top = shape, 0
-    data, rows, columns = list[Floats](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    data, rows, columns = list[Floats](), list[Ints](), list[Ints]()
     for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
         count, size = residual.shape
         row = top + np.arange(count * size).reshape(count, size, 1)
@@ -443,5 +429,4 @@ def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int,
             rows.append(np.broadcast_to(row, (count, size, dof)).ravel())
             columns.append(np.broadcast_to(dof * nodes[:, None, None] + np.arange(dof), (count, size, dof)).ravel())
         top += count * size
-    position = np.concatenate(rows), np.concatenate(columns)
-    return csr_array((np.concatenate([np.empty(0), *data]), position), shape=(top, n * dof))
+    return csr_array((stacked(data), (stacked(rows), stacked(columns))), shape=(top, n * dof))

@@ -1,6 +1,6 @@
 """Factor, Loss and Constraint: M measurements of one kind and their noise, robust losses, bounds on formulas."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import InitVar, dataclass, fields
 from functools import cache, cached_property
 from itertools import groupby
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, frozen, instance, number, one_of
+from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of
 from ...errors import InputError
 from .inputs import (
     check_constants,
@@ -18,7 +18,6 @@ from .inputs import (
     check_std,
     check_values,
     fitting,
-    numbers,
     whitening,
 )
 from .measurements import Measurement, lookup
@@ -112,11 +111,8 @@ class Factor:
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
         measurement = _checked(self)
         self.__dict__["z"] = check_values(measurement, self.z, len(self.nodes))
-        stds = [
-            name
-            for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
-            if v is not None
-        ]
+        noise = {"std": self.std, "sqrt_information": self.sqrt_information, "cov": cov}
+        stds = [name for name, value in noise.items() if value is not None]
         if len(stds) != 1:
             allowed = "exactly one of std, cov and sqrt_information must be given"
             raise InputError("std", " and ".join(stds) or "nothing", allowed, "Give std=.")
@@ -148,12 +144,7 @@ class Factor:
     @property
     def informative(self) -> Bools:
         """(M,) True where the measurement carries information."""
-        if self.std is not None:
-            informed = np.isfinite(self.std).any(axis=-1)
-        else:
-            assert self.sqrt_information is not None
-            informed = (self.sqrt_information != 0).any(axis=(-2, -1))
-        return np.broadcast_to(informed, len(self.nodes))
+        return np.asarray((self.root != 0).any(axis=(1, 2)))
 
     @property
     def root(self) -> Floats:
@@ -175,18 +166,6 @@ def _checked(item: "Factor | Constraint") -> Measurement:
     return measurement
 
 
-def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
-    """A factor of nodes (M, arity), z (M, k) and std (M or 1, size) that come from checked arrays.
-
-    >>> of_checked("range", np.array([[0, 1]]), np.array([[5.0]]), np.array([[0.1]]))
-    Factor(range x 1)
-    """
-    made = object.__new__(Factor)
-    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=np.empty((len(nodes), 0)))
-    made.__dict__.update(std=std, sqrt_information=None, loss=None)
-    return made
-
-
 def unchecked(made: Made, **changes: Any) -> Made:
     """A factor, or another dataclass, with changes that come from checked arrays and need not be checked again."""
     kind: Any = type(made)
@@ -194,6 +173,15 @@ def unchecked(made: Made, **changes: Any) -> Made:
     kept = made.__dict__
     changed.__dict__.update({name: kept[name] for name in names_of(kind)}, **changes)
     return changed
+
+
+def stacked(arrays: Iterable[AnyArray], *width: int) -> AnyArray:
+    """Arrays (M, *width) below one another; (0, *width) of whole numbers if there are none.
+
+    >>> stacked([], 2).shape
+    (0, 2)
+    """
+    return np.concatenate([*arrays] or [np.empty((0, *width), np.int64)])
 
 
 @cache
@@ -205,11 +193,19 @@ def names_of(kind: Any) -> tuple[str, ...]:
 def taken(factor: Factor, rows: Ints) -> Factor:
     """Some measurements of a factor."""
     parts = {
-        name: array[rows] if len(array := getattr(factor, name)) == len(factor.nodes) else array
+        name: array[rows]
         for name in ("z", "std", "sqrt_information", "constants")
-        if getattr(factor, name) is not None
+        if (array := getattr(factor, name)) is not None and len(array) == len(factor.nodes)
     }
     return unchecked(factor, nodes=factor.nodes[rows], **parts)
+
+
+def reweighed(factor: Factor, share: Floats | float) -> Factor:
+    """A factor whose W is a `share` of what it was, one number or (M, 1) of them; nothing is an infinite std."""
+    if factor.sqrt_information is not None:
+        return unchecked(factor, sqrt_information=factor.sqrt_information * np.asarray(share)[..., None])
+    with np.errstate(divide="ignore"):
+        return unchecked(factor, std=np.asarray(factor.std) / share)
 
 
 def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
@@ -275,7 +271,7 @@ class Constraint:
         measurement = _checked(self)
         if measurement.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
-        limits = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
+        limits = {name: checked(name, getattr(self, name)) for name in ("lower", "upper")}
         sizes = [side.shape[-1] for side in limits.values() if side.ndim]
         size = max(sizes, default=measurement.size())
         fitting(measurement, size)
@@ -308,9 +304,10 @@ class Constraint:
 
 def as_factor(constraint: Constraint) -> Factor:
     """The factor whose residual is h of a constraint, angles in [-pi, pi]."""
-    shape = constraint.lower.shape
-    factor = of_checked(constraint.kind, constraint.nodes, np.zeros(shape), np.ones((1, shape[1])))
-    return unchecked(factor, constants=constraint.constants)
+    made, shape = object.__new__(Factor), constraint.lower.shape
+    made.__dict__.update(kind=constraint.kind, nodes=constraint.nodes, constants=constraint.constants)
+    made.__dict__.update(z=np.zeros(shape), std=np.ones((1, shape[1])), sqrt_information=None, loss=None)
+    return made
 
 
 def bounded(constraint: Constraint) -> Bools:

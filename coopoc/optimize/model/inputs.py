@@ -20,7 +20,7 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
     >>> whitening("range", [[4.0]])
     array([[0.5]])
     """
-    array = numbers("cov", cov)
+    array = checked("cov", cov)
     if array.ndim < 2 or array.shape[-1] != array.shape[-2]:
         raise InputError("cov", array.shape, "must be square matrices", "Give variances on the diagonal, m^2 or rad^2.")
     flat = array.reshape(-1, *array.shape[-2:])
@@ -39,18 +39,13 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
 @lru_cache(maxsize=256)
 def fitting(measurement: Measurement, width: int) -> int | None:
     """The dimension whose z has `width` numbers; None if both have; InputError if none has."""
-    fits = [d for d in (2, 3) if (d == 3 or measurement.plane is not None) and measurement.width(d) == width]
+    widths = {d: measurement.width(d) for d in (2, 3) if d == 3 or measurement.plane is not None}
+    fits = [d for d, own in widths.items() if own == width]
     if not fits:
-        allowed = sorted({measurement.width(d) for d in (2, 3) if d == 3 or measurement.plane is not None})
         hint = "Write poses with coopoc.optimize.pose." if measurement.compares_poses else "Give one per component."
-        words = f"must have {' or '.join(map(str, allowed))}"
+        words = f"must have {' or '.join(map(str, sorted({*widths.values()})))}"
         raise InputError(f"z of {measurement.name}", f"{width} numbers per row", words, hint)
     return fits[0] if len(fits) == 1 else None
-
-
-def numbers(field: str, values: npt.ArrayLike) -> Floats:
-    """Read-only array of what a user gave; InputError if it is no array of numbers."""
-    return checked(field, values)
 
 
 def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
@@ -70,7 +65,7 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
     """(M, c) finite numbers, as many as the kind has."""
     if measurement.constants == 0 and (constants is None or np.size(constants) == 0):
         return frozen(np.empty((count, 0)))
-    values = numbers(f"constants of {measurement.name}", [] if constants is None else constants)
+    values = checked(f"constants of {measurement.name}", [] if constants is None else constants)
     fits = (
         values.ndim in (1, 2)
         and values.shape[-1] == measurement.constants
@@ -86,7 +81,7 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
 
 def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
     """z as (M, k): finite, distances > 0, angles in radians, rotations that are some."""
-    array = numbers(f"z of {measurement.name}", z)
+    array = checked(f"z of {measurement.name}", z)
     if array.ndim != 2 or len(array) != count:
         shape = f"must have shape ({count}, {measurement.width()}) for {measurement.name}"
         raise InputError("z", array.shape, shape, "One row per row of nodes; a problem for each run.")
@@ -121,7 +116,7 @@ def check_rotations(field: str, rotation: Floats) -> None:
 
 def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple[int, int]) -> Floats:
     """std as (M or 1, size): > 0, angles at most pi."""
-    array, size = numbers(f"std of {measurement.name}", std), shape[-1]
+    array, size = checked(f"std of {measurement.name}", std), shape[-1]
     wide = np.broadcast_to(array, (1, size)) if array.ndim < 2 and array.size in (1, size) else array
     if wide.ndim != 2 or wide.shape[1] != size or len(wide) not in (1, shape[0]):
         allowed = f"must have shape ({size},) or {shape}"
@@ -139,7 +134,7 @@ def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple
 
 def check_root(measurement: Measurement, root: npt.ArrayLike, shape: tuple[int, int]) -> Floats:
     """sqrt_information as (M or 1, size, size), finite."""
-    array, size = numbers("sqrt_information", root), shape[-1]
+    array, size = checked("sqrt_information", root), shape[-1]
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.shape[1:] != (size, size) or len(array) not in (1, shape[0]):
         allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"

@@ -74,7 +74,7 @@ class Measurement:
 
     def predict(self, vector: Floats, constants: Sequence[float] = ()) -> Floats:
         """(..., size) h of vectors (..., d), for kinds that see no rotation."""
-        parts = self.residual(columns(vector), [0.0] * self.size(vector.shape[-1]), constants, np)
+        parts = self.residual([*np.moveaxis(vector, -1, 0)], [0.0] * self.size(vector.shape[-1]), constants, np)
         return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
     def residual(self, local: Sequence[Any], z: Iterable[Any], constants: Iterable[Any], m: Any) -> list[Any]:
@@ -94,11 +94,6 @@ class Measurement:
             return [self.formula(*arguments, embed([*z], dimension), m)[k] for k in kept]
         predicted = self.formula(*arguments, *constants, m)
         return [predicted[k] - number for k, number in zip(kept, z, strict=True)]
-
-
-def columns(array: Floats) -> list[Floats]:
-    """The components of (..., k), views (...)."""
-    return [array[..., k] for k in range(array.shape[-1])]
 
 
 def embed(numbers: Sequence[Any], dimension: int) -> list[Any]:
@@ -312,14 +307,8 @@ LEAST_SINE = 0.05
 """Of the inclination: near the vertical the azimuth carries no information."""
 
 
-def is_converted(measurement: Measurement) -> bool:
-    """Whether a kind's measurements become vectors; of the others those that are linear stay, and angles are left out.
-
-    >>> from coopoc.optimize.model.measurements import lookup
-    >>> is_converted(lookup("spherical")), is_converted(lookup("range"))
-    (True, False)
-    """
-    return measurement.name == "spherical"
+CONVERTED = "spherical"
+"""The kind whose measurements become vectors; of the others those that are linear stay, and angles are left out."""
 
 
 def converted_rows(z: list[Any], m: Any) -> tuple[Any, list[list[Any]]]:

@@ -1,7 +1,7 @@
 """Problem: nodes and factors between them; whitened residuals, their exact Jacobian and the cost."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, frozen, listed
+from ...arrays import Bools, Floats, Ints, checked, frozen, listed
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise, sparse_jacobian
 from .factor import Constraint, Factor, names_of, taken, unchecked
-from .inputs import check_rotations, numbers
+from .inputs import check_rotations
 from .measurements import lookup
 from .space import Space
 from .window import Noise, window
@@ -117,7 +117,7 @@ class Problem:
             if not isinstance(item, Factor | Constraint):
                 hint = "Add measurements with Problem.add, constraints with Problem.constrain."
                 raise InputError("factors, constraints", shown(item), "must be Factors and Constraints", hint)
-            check_item(item, self.names, self.poses, self.dimension)
+            check_item(item, self.names, self._turning, self.dimension)
         if self.x0 is not None:
             self.__dict__["x0"] = frozen(points(self.space, len(self.names), "x0", self.x0))
         if self.fixed and self.x0 is None:
@@ -194,10 +194,7 @@ class Problem:
             loss=loss,
             cov=cov,
         )
-        return self._with(factor)
-
-    def _with(self, factor: Factor) -> "Problem":
-        """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
+        # it alone is checked: what was checked and found before is kept
         check_item(factor, self.names, self._turning, self.dimension)
         return self.replace_unchecked(factors=(*self.factors, factor))
 
@@ -218,7 +215,7 @@ class Problem:
         size = lookup(kind).size(self.dimension)
         low, high = (
             np.broadcast_to(limit, (len(index), size)) if limit.ndim == 0 else limit
-            for limit in (numbers("lower", lower), numbers("upper", upper))
+            for limit in (checked("lower", lower), checked("upper", upper))
         )
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
@@ -231,16 +228,15 @@ class Problem:
                 changed.__dict__[name] = kept[name]
         return changed
 
-    def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints] | None = None) -> "Problem":
+    def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints]) -> "Problem":
         """The problem of some nodes, from x, which has no separator.
 
         Args:
             used: (n,) which nodes.
             x: (n, ambient).
-            rows: of each factor, among the nodes that are used; None: all among them.
+            rows: of each factor, among the nodes that are used.
         """
         number = np.cumsum(used) - 1
-        rows = self.rows_among(used) if rows is None else rows
         kept = [taken(factor, own) for factor, own in zip(self.factors, rows, strict=True) if len(own)]
         changes: dict[str, Any] = {
             name: tuple(number[[k for k in getattr(self, name) if used[k]]].tolist()) for name in ("poses", "fixed")
@@ -355,11 +351,11 @@ def several(nodes: Any) -> list[Any]:
 
 def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
     """z (count, size) from a number, a row or rows."""
-    values = numbers(f"z of {kind}", z)
+    values = checked(f"z of {kind}", z)
     return values.reshape(count, -1) if values.ndim < 2 and values.size % count == 0 else values
 
 
-def check_item(item: Factor | Constraint, names: Sequence[str], poses: Collection[int], dimension: int) -> None:
+def check_item(item: Factor | Constraint, names: Sequence[str], poses: frozenset[int], dimension: int) -> None:
     """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
     measurement, nodes = item.measurement, item.nodes
     if len(beyond := nodes[(nodes < 0) | (nodes >= len(names))]):
@@ -368,8 +364,7 @@ def check_item(item: Factor | Constraint, names: Sequence[str], poses: Collectio
         hint = f"Make it with Problem(names, dimension={item.dimension})." if measurement.plane else "Leave it out."
         raise InputError(f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {dimension}", hint)
     observers = {"body": nodes[:, :1], "relative": nodes}.get(measurement.frame, nodes[:, :0])
-    turning = poses if isinstance(poses, frozenset) else frozenset(poses) if observers.size else frozenset()
-    if lacking := sorted(set(observers.ravel().tolist()) - turning):
+    if lacking := sorted(set(observers.ravel().tolist()) - poses):
         allowed = "must be a pose: the measurement is in its body frame"
         raise InputError(f"nodes of {item.kind}", names[lacking[0]], allowed, "Name it in Problem(names, poses=[...]).")
 
@@ -384,7 +379,7 @@ def no_such_node(
 
 def points(space: Space, n: int, field: str, x: npt.ArrayLike) -> Floats:
     """x as an array (n, ambient); InputError if it is not one, or holds matrices of no rotation."""
-    array = numbers(field, x)
+    array = checked(field, x)
     if array.shape != (n, space.ambient) or not np.isfinite(array).all():
         actual = f"shape {array.shape}" if np.isfinite(array).all() else "not finite"
         hint = "Make it with coopoc.optimize.pose." if space.has_rotation else "Give one row of metres per point."

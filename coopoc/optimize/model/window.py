@@ -65,15 +65,14 @@ def drive_factors(
 
 def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Factor]:
     """Factors of range, azimuth and inclination (M, 3): of the three where all are there, else of what is."""
-    whole = np.isfinite(relative).all(axis=1, keepdims=True)
-    std = np.ones(3) if sensors is None else relative_std(relative, sensors)
-    complete = np.where(whole, relative, np.nan)
     if sensors is None:
-        factors = _measured("displacement", edges, to_vector(complete), std)
+        std, factors = np.ones(3), _measured("displacement", edges, to_vector(relative), np.ones(3))
     else:
-        factors = _measured("spherical", edges, complete, std)
-    for k, kind in enumerate(() if whole.all() else ("range", "azimuth", "inclination")):
-        factors += _measured(kind, edges, np.where(whole, np.nan, relative)[:, k, None], std[..., k, None])
+        std = relative_std(relative, sensors)
+        factors = _measured("spherical", edges, relative, std)
+    partial = np.where(np.isfinite(relative).all(axis=1, keepdims=True), np.nan, relative)
+    for k, kind in enumerate(("range", "azimuth", "inclination")):
+        factors += _measured(kind, edges, partial[:, k, None], std[..., k, None])
     return factors
 
 
@@ -130,11 +129,8 @@ def window(
 
 
 def _check(recording: Recording, step: int, length: int, run: int) -> None:
-    for name, value in (("step", step), ("length", length), ("run", run)):
-        number(name, value, -(2**62), 2**62, kind=int, allowed="counted from 0", hint="Give a whole number.")
-    if not 0 <= step < len(recording.t):
-        raise InputError("step", step, f"must be in 0..{len(recording.t) - 1}", "The drive has no other steps.")
-    if not 1 <= length <= step + 1:
-        raise InputError("length", length, f"must be in 1..{step + 1} at step {step}", "Start later or shorten it.")
-    if not 0 <= run < recording.runs:
-        raise InputError("run", run, f"must be in 0..{recording.runs - 1}", "Or None for all at once.")
+    last, runs = len(recording.t) - 1, recording.runs
+    number("step", step, 0, last, kind=int, allowed=f"in 0..{last}", hint="The drive has no other steps.")
+    allowed = f"in 1..{step + 1} at step {step}"
+    number("length", length, 1, step + 1, kind=int, allowed=allowed, hint="Start later or shorten it.")
+    number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}", hint="A problem is one of the runs.")

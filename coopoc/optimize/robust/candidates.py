@@ -9,7 +9,7 @@ import numpy.typing as npt
 from ...arrays import AnyArray, Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
 from ..assess.assess import squared
-from ..model.factor import Factor, unchecked
+from ..model.factor import Factor, reweighed
 from ..model.problem import Problem
 
 Candidates = Sequence[int | tuple[int, Sequence[int]]]
@@ -18,19 +18,50 @@ Candidates = Sequence[int | tuple[int, Sequence[int]]]
 
 @dataclass(frozen=True, eq=False)
 class Marked:
-    """The M candidate measurements: factor, row and group (M,), groups numbered from 0."""
+    """A problem of which M measurements are candidates.
 
+    Args:
+        problem: whose candidates have no loss.
+        factor: (M,) of each.
+        row: (M,) of that factor.
+        group: (M,) which of the G that share a weight, numbered from 0.
+        bound: (G,) c^2.
+    """
+
+    problem: Problem
     factor: Ints
     row: Ints
     group: Ints
+    bound: Floats
 
     def sums(self, values: Floats) -> Floats:
         """(G,) sums over each group of values (M,)."""
-        return np.asarray(np.bincount(self.group, values, int(self.group.max(initial=-1)) + 1), np.float64)
+        return np.asarray(np.bincount(self.group, values, len(self.bound)), np.float64)
+
+    def collected(self, of: Callable[[Factor], AnyArray]) -> Floats:
+        """(G,) sums over each group of what there is of each measurement of a factor."""
+        values = np.empty(len(self.row))
+        for k in np.unique(self.factor):
+            here = self.factor == k
+            values[here] = of(self.problem.factors[k])[self.row[here]]
+        return self.sums(values)
+
+    def squares(self, x: Floats) -> Floats:
+        """(G,) r^2 of each group at x (n, ambient)."""
+        return self.collected(lambda factor: squared(self.problem, factor, x))
+
+    def reweigh(self, weight: Floats, x0: Floats) -> Problem:
+        """The problem from x0 (n, ambient), with W of the candidates times sqrt(weight) (G,)."""
+        factors = list(self.problem.factors)
+        for k in np.unique(self.factor):
+            here, root = self.factor == k, np.ones((len(factors[k].nodes), 1))
+            root[self.row[here], 0] = np.sqrt(weight[self.group[here]])
+            factors[k] = reweighed(factors[k], root)
+        return self.problem.replace_unchecked(factors=tuple(factors), x0=frozen(x0))
 
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
-    """The candidates, checked."""
+    """The problem with its candidates, checked; their bounds are yet to be given."""
     instance("problem", problem, Problem)
     places: list[tuple[int, int]] = []
     for item in candidates if isinstance(candidates, Sequence) else [candidates]:
@@ -55,41 +86,13 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
         actual = f"shape {labels.shape} of {labels.dtype}"
         raise InputError("groups", actual, allowed, "Leave it out to judge each alone.")
     factor_of, row = np.array(places).T
-    return Marked(factor_of, row, np.unique(labels, return_inverse=True)[1])
+    names, group = np.unique(labels, return_inverse=True)
+    return Marked(problem, factor_of, row, group, np.ones(len(names)))
 
 
-def reweigh(problem: Problem, marked: Marked, weight: Floats, x0: Floats) -> Problem:
-    """The problem from x0 (n, ambient), with W of the candidates times sqrt(weight) (G,) in place of their loss."""
-    factors = list(problem.factors)
-    for k in np.unique(marked.factor):
-        factor, here = factors[k], marked.factor == k
-        root = np.ones((len(factor.nodes), 1))
-        root[marked.row[here], 0] = np.sqrt(weight[marked.group[here]])
-        if factor.std is None:
-            factors[k] = unchecked(factor, loss=None, sqrt_information=factor.sqrt_information * root[..., None])
-        else:
-            with np.errstate(divide="ignore"):  # no weight is an infinite std
-                factors[k] = unchecked(factor, loss=None, std=factor.std / root)
-    return problem.replace_unchecked(factors=tuple(factors), x0=frozen(x0))
-
-
-def squares(problem: Problem, marked: Marked, x: Floats) -> Floats:
-    """(G,) r^2 of each group at x (n, ambient)."""
-    return _sums(problem, marked, lambda factor: squared(problem, factor, x))
-
-
-def bounds(problem: Problem, marked: Marked, threshold: float) -> Floats:
+def bounds(marked: Marked, threshold: float) -> Floats:
     """(G,) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
     from scipy.special import gammaincinv
 
-    freedom = _sums(problem, marked, lambda factor: (factor.root != 0).any(axis=-1).sum(axis=-1))
+    freedom = marked.collected(lambda factor: (factor.root != 0).any(axis=-1).sum(axis=-1))
     return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
-
-
-def _sums(problem: Problem, marked: Marked, of: Callable[[Factor], AnyArray]) -> Floats:
-    """(G,) sums over each group of what there is of each measurement of a factor."""
-    sums = np.empty(len(marked.row))
-    for k in np.unique(marked.factor):
-        here = marked.factor == k
-        sums[here] = of(problem.factors[k])[marked.row[here]]
-    return marked.sums(sums)

@@ -18,7 +18,7 @@ from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
 from ..starts.initial import initial_guess
-from .candidates import Candidates, bounds, mark, reweigh, squares
+from .candidates import Candidates, bounds, mark
 from .graduated import Graduation, contest, graduate, surrogate_of
 from .loop_closures import known_start
 
@@ -91,8 +91,8 @@ def solve_gnc(
     problem = started(instance("problem", problem, Problem))
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, Start)
-    bound, each, extras, began = bounds(problem, marked, threshold), list[int](), dict[str, Any](), clock()
-    doubts: tuple[str, ...] = ()
+    marked = replace(marked, bound=bounds(marked, threshold))
+    each, extras, began, doubts = list[int](), dict[str, Any](), clock(), tuple[str, ...]()
 
     def inner(part: Problem) -> Floats:
         if problem.constraints:
@@ -104,21 +104,20 @@ def solve_gnc(
         return end.x
 
     def finish(at: Floats, weight: Floats | None = None) -> Graduation:
-        weight = np.ones(len(bound)) if weight is None else weight
-        return graduate(problem, marked, bound, surrogate, inner, at, weight, surrogate.last)
+        return graduate(marked, surrogate, inner, at, surrogate.last, weight)
 
     def explained(end: Graduation) -> bool:  # the minimum of ranges and angles need not be the only one
-        part = reweigh(problem, marked, end.weight, end.x)
+        part = marked.reweigh(end.weight, end.x)
         single = all(m.linear or m.compares_poses for m in {problem.factors[k].measurement for k in marked.factor})
         return single and not implausible(sparse(part).cost(end.x), *expected(part, sparse(part).size))
 
     def cost(at: Floats) -> float:
-        s = squares(problem, marked, at) / bound
+        s = marked.squares(at) / marked.bound
         spent = np.minimum(s, 1.0) if loss == "truncated" else s / (1.0 + s)
-        return sparse(reweigh(problem, marked, np.zeros(len(bound)), at)).cost(at) + 0.5 * float(bound @ spent)
+        return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ spent)
 
     try:
-        from_known = known_start(problem, marked, bound, inner)
+        from_known = known_start(marked, inner)
     except InputError:  # known inliers leave nodes free, and candidates do not place them
         if start == "known":
             raise
@@ -129,18 +128,18 @@ def solve_gnc(
         extras |= {"joined": from_known.joined} if from_known.joined else {}
     if end is None or (start == "any" and not explained(end)):
         best, x, graduation, doubts = contest(
-            problem, marked, bound, surrogate, inner, initial_guess(problem), lambda at: finish(at).x, cost
+            marked, surrogate, inner, initial_guess(problem), lambda at: finish(at).x, cost
         )
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
     extras["start"] = best
-    final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
+    final = solve(marked.reweigh(end.weight, end.x), backend, throw=throw and end.settled, **options)
     extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
     work: dict[str, Any] = {"iterations": sum(each) + final.iterations}
     work["solve_seconds"] = clock() - began - final.build_seconds - final.check_seconds
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < INLIER_WEIGHT).sum())
-    notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()
+    notes = (rejection("GNC", out, len(end.weight), "candidates", final.cost, final.expected),) if out else ()
     solution = replace(
         final, extras=final.extras | extras, status=status, notes=(*notes, *doubts, *final.notes), **work
     )

@@ -1,7 +1,7 @@
 """The graduated loop: weighted least squares and weights alternate while a nearly convex surrogate becomes the loss."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
 from ..starts.mirrors import across, movable
 from ..starts.race import drawn
-from .candidates import Marked, mark, reweigh, squares
+from .candidates import Marked, mark
 
 ROUNDS = 300
 """About 20 are needed."""
@@ -90,29 +90,27 @@ class Graduation(NamedTuple):
 
 
 def graduate(
-    problem: Problem,
     marked: Marked,
-    bound: Floats,
     surrogate: Surrogate,
     inner: Callable[[Problem], Floats],
     x: Floats,
-    weight: Floats,
     mu: float,
+    weight: Floats | None = None,
 ) -> Graduation:
-    """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), weight (G,) and mu."""
+    """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), mu and weight (G,),
+    default ones."""
+    weight = np.ones(len(marked.bound)) if weight is None else weight
     for rounds in range(ROUNDS):
-        new = surrogate.weight(squares(problem, marked, x) / bound, mu)
+        new = surrogate.weight(marked.squares(x) / marked.bound, mu)
         settled, weight = surrogate.done(new, weight, mu), new
         if settled:
             return Graduation(x, weight, rounds, mu, True)
-        x, mu = inner(reweigh(problem, marked, weight, x)), surrogate.later(mu)
+        x, mu = inner(marked.reweigh(weight, x)), surrogate.later(mu)
     return Graduation(x, weight, ROUNDS, mu, False)
 
 
 def contest(
-    problem: Problem,
     marked: Marked,
-    bound: Floats,
     surrogate: Surrogate,
     inner: Callable[[Problem], Floats],
     start: Floats,
@@ -126,18 +124,19 @@ def contest(
     more. At last what ranges alone place is mirrored.
 
     Args:
-        problem: whose candidates have no loss.
+        marked: the problem and its candidates.
+        surrogate: of their loss.
         inner: solves a problem from its x0.
         start: (n, ambient).
         finish: from where a start leads to a minimum of the cost.
         cost: that is to be least.
     """
-    x = inner(reweigh(problem, marked, np.ones(len(bound)), start))
-    mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
-    graduation = graduate(problem, marked, bound, surrogate, inner, x, np.ones(len(bound)), mu)
+    x = inner(marked.problem.replace_unchecked(x0=frozen(start)))
+    mu = surrogate.first(float((marked.squares(x) / marked.bound).max()))
+    graduation = graduate(marked, surrogate, inner, x, mu)
     if bool((graduation.weight == 1.0).all()):
         return "graduated", finish(graduation.x), graduation, ()
-    huber, cauchy = (softened(problem, marked, bound, name) for name in ("huber", "cauchy"))
+    huber, cauchy, truncated = (softened(marked, name) for name in ("huber", "cauchy", "truncated"))
 
     with progress("robust") as counted:
 
@@ -154,15 +153,14 @@ def contest(
         ends = {name: landed(at) for name, at in starts.items()}
         costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
         best = min(ends, key=costs.__getitem__)
-        truncated, loose = softened(problem, marked, bound, "truncated"), movable(cauchy)
+        loose = movable(cauchy)
         mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
         best_x, notes = drawn(cauchy, mirrored_x, loose, lambda at: landed(soft(at)), cost)
         name, least = best if best_x is mirrored_x else "drawn", np.inf
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)
             if len(loose):
-                mu = surrogate.first(AGAIN)
-                again = graduate(problem, marked, bound, surrogate, inner, best_x, np.ones(len(bound)), mu)
+                again = graduate(marked, surrogate, inner, best_x, surrogate.first(AGAIN))
                 best_x = min((best_x, landed(again.x)), key=cost)
             best_x, moves, *_ = across(
                 truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
@@ -171,19 +169,19 @@ def contest(
     return name + ", mirrored" * (moved > 0), best_x, graduation, notes
 
 
-def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Problem:
+def softened(marked: Marked, loss: str) -> Problem:
     """The problem with a loss on its candidates (their rows are factors of their own), each of the scale of its
     group."""
     factors = list[Factor]()
-    for k, factor in enumerate(problem.factors):
+    for k, factor in enumerate(marked.problem.factors):
         here = marked.factor == k
-        rows, scale = marked.row[here], np.sqrt(bound[marked.group[here]])
+        rows, scale = marked.row[here], np.sqrt(marked.bound[marked.group[here]])
         rest = np.setdiff1d(np.arange(len(factor.nodes)), rows)
         factors += [taken(factor, rest)] if len(rest) else []
         factors += [
             unchecked(taken(factor, rows[scale == each]), loss=Loss(loss, float(each))) for each in np.unique(scale)
         ]
-    return problem.replace_unchecked(factors=tuple(factors))
+    return marked.problem.replace_unchecked(factors=tuple(factors))
 
 
 def robust_start(problem: Problem, start: Floats) -> Problem:
@@ -201,11 +199,11 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     """
     if problem.constraints:
         return problem
-    steps, factors = 0, problem.factors
-    robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None}
-    bare = tuple(unchecked(f, loss=None) if k in robust else f for k, f in enumerate(factors))
+    steps, search = 0, problem.search
+    robust = {k: f.loss for k, f in enumerate(problem.factors) if f.loss is not None}
+    bare = tuple(unchecked(f, loss=None) for f in problem.factors)
     marked = mark(problem.replace_unchecked(factors=bare), list(robust))
-    bound = np.array([robust[k].scale ** 2 for k in marked.factor.tolist()])
+    marked = replace(marked, bound=np.array([robust[k].scale ** 2 for k in marked.factor.tolist()]))
 
     def inner(part: Problem) -> Floats:
         nonlocal steps
@@ -215,16 +213,13 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
 
     surrogate = SURROGATES.get(next(iter(robust.values())).name, SURROGATES["truncated"])
     best, x, _, notes = contest(
-        problem.replace_unchecked(factors=bare),
         marked,
-        bound,
         surrogate,
         inner,
         start,
         lambda at: inner(problem.replace_unchecked(x0=frozen(at))),
         sparse(problem).cost,
     )
-    search = problem.search
     name = search.start if best == "x0" and search.start else best
     return problem.replace_unchecked(
         x0=frozen(x),

@@ -1,7 +1,7 @@
 """Loop closures by gating and consensus: candidates join known inliers where these predict them, as a start of GNC."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..model.space import carried
 from ..starts.graph_starts import parts
 from ..starts.initial import initial_guess
 from ..starts.pose_starts import along_poses
-from .candidates import Marked, reweigh, squares
+from .candidates import Marked
 
 ROUNDS = 100
 """About 15 are needed: half of those that fit join in each."""
@@ -58,7 +58,7 @@ class KnownStart:
     joined: tuple[dict[str, Any], ...]
 
 
-def known_start(problem: Problem, marked: Marked, bound: Floats, inner: Callable[[Problem], Floats]) -> KnownStart:
+def known_start(marked: Marked, inner: Callable[[Problem], Floats]) -> KnownStart:
     """Candidates join where the others predict them: first within what known inliers hold together, then between.
 
     A candidate fits where d^2 = r^T (J P J^T + cov)^-1 r is within its bound, P the covariance of its nodes given all
@@ -72,9 +72,7 @@ def known_start(problem: Problem, marked: Marked, bound: Floats, inner: Callable
     the pair with most agreement first, and the rounds go on.
 
     Args:
-        problem: a single one.
-        marked: the candidates.
-        bound: (G,) c^2.
+        marked: the problem and its candidates.
         inner: solves a weighted problem.
 
     Raises:
@@ -85,12 +83,11 @@ def known_start(problem: Problem, marked: Marked, bound: Floats, inner: Callable
         gate of a predicted measurement. Olson, Agarwal, IJRR 2013, and Mangelson et al., ICRA 2018, on graphs.
         Fischler, Bolles, Random Sample Consensus, 1981.
     """
-    search, rounds, joined = _Search(problem, marked, bound), 0, list[dict[str, Any]]()
+    search, rounds, joined = _Search(marked), 0, list[dict[str, Any]]()
     while True:
         body = search.bodies()
-        whole = pinned(problem, body)
-        rounds += search.grow(whole, body, inner)
-        if whole is problem:
+        rounds += search.grow(body, inner)
+        if (body == WORLD_BODY).all():
             return KnownStart(search.x, search.weight, rounds, tuple(joined))
         joined.append(search.join(search.bodies()))
 
@@ -122,15 +119,15 @@ class _Search:
     """What has been decided: x (n, ambient), each free body in a frame of its own; weight (G,) of the candidates that
     have joined; left (G,) how often each has left."""
 
-    def __init__(self, problem: Problem, marked: Marked, bound: Floats) -> None:
-        self.problem, self.marked, self.bound = problem, marked, bound
-        self.weight, self.left = np.zeros(len(bound)), np.zeros(len(bound), dtype=np.int64)
-        self.x = along_poses(reweigh(problem, marked, self.weight, initial_guess(problem)))
+    def __init__(self, marked: Marked) -> None:
+        self.problem, self.marked, self.bound = marked.problem, marked, marked.bound
+        self.weight, self.left = np.zeros(len(self.bound)), np.zeros(len(self.bound), dtype=np.int64)
+        self.x = along_poses(marked.reweigh(self.weight, initial_guess(self.problem)))
 
     def bodies(self) -> Ints:
         """(n,) the body of each node, WORLD_BODY or its first pose (if it has none, its first node)."""
         problem = self.problem
-        measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
+        measured = [f.nodes[f.informative] for f in self.marked.reweigh(self.weight, self.x).factors]
         pairs = (nodes[:, k : k + 2] for nodes in measured for k in range(nodes.shape[1] - 1))
         part = parts(len(problem.names), *pairs)
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
@@ -149,17 +146,18 @@ class _Search:
             end_of[here, 2 - nodes.shape[1] :] = body[nodes]
         return np.sort(end_of, axis=1)
 
-    def grow(self, problem: Problem, body: Ints, inner: Callable[[Problem], Floats]) -> int:
-        """Rounds of a pinned problem until no more candidates join within the bodies."""
-        marked, bound, weight, left, ends = self.marked, self.bound, self.weight, self.left, self.ends(body)
+    def grow(self, body: Ints, inner: Callable[[Problem], Floats]) -> int:
+        """Rounds of the problem with the bodies pinned, until no more candidates join within them."""
+        marked = replace(self.marked, problem=pinned(self.problem, body))
+        bound, weight, left, ends = self.bound, self.weight, self.left, self.ends(body)
         judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
-        sparse(problem)  # is kept as long as the problem is, so that all rounds share its analysis
+        sparse(marked.problem)  # is kept as long as the problem is, so that all rounds share its analysis
         most_joins, rounds = 1, 0
         while rounds < ROUNDS:
-            self.x, rounds = inner(reweigh(problem, marked, weight, self.x)), rounds + 1
-            leaving = judged & (weight > 0) & (squares(problem, marked, self.x) > bound)
+            self.x, rounds = inner(marked.reweigh(weight, self.x)), rounds + 1
+            leaving = judged & (weight > 0) & (marked.squares(self.x) > bound)
             left[leaving], weight[leaving] = left[leaving] + 1, 0.0
-            distance, volume = predicted(problem, marked, weight, self.x)
+            distance, volume = predicted(marked, weight, self.x)
             others = judged & (weight == 0) & (left < most_joins)
             fits = others & (distance <= bound)
             if fits.any():
@@ -169,11 +167,11 @@ class _Search:
             else:
                 some = np.flatnonzero(others & (distance <= NONLINEAR_FACTOR * bound))
                 some = some[np.argsort(-volume[some], kind="stable")][:MAX_RESOLVES]
-                if not any(self._explained(problem, group) for group in some.tolist()):
+                if not any(self._explained(marked, group) for group in some.tolist()):
                     break
         return rounds
 
-    def _explained(self, problem: Problem, group: int) -> bool:
+    def _explained(self, marked: Marked, group: int) -> bool:
         """Whether twice the cost grows by no more than the bound where a group joins, which it then does.
 
         Where the model is linear that growth is d^2. Far along a drive whose heading has become uncertain it is less.
@@ -181,7 +179,7 @@ class _Search:
         costs = []
         for joins in (0.0, 1.0):
             self.weight[group] = joins
-            system = sparse(reweigh(problem, self.marked, self.weight, self.x))
+            system = sparse(marked.reweigh(self.weight, self.x))
             costs.append(system.cost(arrive(system, self.x, STEPS, TOLERANCE).x if joins else self.x))
         good = 2.0 * (costs[1] - costs[0]) <= self.bound[group]
         self.weight[group] = float(good)
@@ -233,7 +231,7 @@ class _Search:
         number, space, tried = np.cumsum([len(own) > 0 for own in rows]) - 1, problem.space, list[Placement]()
         kept = np.flatnonzero([r in rows[k] for k, r in zip(marked.factor, marked.row, strict=True)])
         rank = [np.searchsorted(rows[k], r) for k, r in zip(marked.factor[kept], marked.row[kept], strict=True)]
-        inside = Marked(number[marked.factor[kept]], np.array(rank, dtype=np.int64), marked.group[kept])
+        inside = Marked(part, number[marked.factor[kept]], np.array(rank, np.int64), marked.group[kept], self.bound)
         sparse(part)  # is kept as long as the part is, so that all placements share its analysis
         origin = space.join(np.zeros(space.dimension))
         for _ in range(2):  # spread over all, then over what the best leaves
@@ -250,7 +248,7 @@ class _Search:
                 else:
                     move = np.stack([self.x[i], carried(space, origin, z, self.x[j])])
                 weight[group] = 1.0
-                distance, _ = predicted(part, inside, weight, self._placed(body, bodies[1], move)[used])
+                distance, _ = predicted(inside, weight, self._placed(body, bodies[1], move)[used])
                 fits = np.zeros(len(self.bound), dtype=bool)
                 fits[groups] = distance[groups] <= self.bound[groups]
                 fits[group] = True
@@ -266,13 +264,13 @@ def pinned(problem: Problem, body: Ints) -> Problem:
     return problem.replace_unchecked(fixed=(*problem.fixed, *first)) if first else problem
 
 
-def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats]:
+def predicted(marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats]:
     """d^2 and log det(J P J^T + cov), in units of cov, of each group (G,), given what has a weight (G,) at x.
 
     Raises:
         InputError: that leaves nodes free.
     """
-    system = sparse(reweigh(problem, marked, weight, x))
+    problem, system = marked.problem, sparse(marked.reweigh(weight, x))
     if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
         raise InputError("candidates", repr(problem), "must leave known inliers that hold all nodes", HINT)
     distance, volume = np.zeros(len(marked.row)), np.zeros(len(marked.row))
@@ -281,9 +279,7 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         factor = taken(problem.factors[k], marked.row[here])
         with np.errstate(all="ignore"):
             linear = linearise(problem.space, [factor], None, x)
-        shape = (len(factor.nodes), factor.size, problem.space.dof)
-        J = np.concatenate([np.broadcast_to(own, shape) for own in linear.jacobian[0]], axis=2)
-        r = linear.residual[0]
+        J, r = np.concatenate(linear.jacobian[0], axis=2), linear.residual[0]
         # an angle between nodes that coincide has no derivative
         lost = ~np.isfinite(r).all(axis=1) | ~np.isfinite(J).all(axis=(1, 2))
         r, J = np.where(lost[:, None], 0.0, r), np.where(lost[:, None, None], 0.0, J)
@@ -298,5 +294,4 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         variance = np.maximum(variance, 1.0)  # as it is but for rounding, of nodes that are nearly free
         distance[here] = np.where(lost, np.inf, (np.einsum("mkj,mk->mj", axes, r) ** 2 / variance).sum(axis=1))
         volume[here] = np.log(variance).sum(axis=1)
-    sums = [np.asarray(np.bincount(marked.group, each, len(weight)), np.float64) for each in (distance, volume)]
-    return sums[0], sums[1]
+    return marked.sums(distance), marked.sums(volume)

@@ -1,7 +1,6 @@
 """Starts of a graph: chained odometry, a spanning tree, points by trilateration, and one that grows with the drive."""
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from ...formats.graph import Graph
 from ..algebra.cholesky import cholesky_of, columns_solved
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import GROWTH, arrive
+from ..model.factor import stacked
 from ..model.problem import Problem
 from ..model.space import Space, carried, exp, log
 
@@ -46,38 +46,32 @@ HOLDING = 2
 """Ranges per dimension from which a point is placed by them."""
 
 
-class Moves(NamedTuple):
-    """M measured relative poses: nodes (M, 2), position (M, d) m, rotation (M, d, d), and their length (M,) > 0."""
-
-    nodes: Ints
-    position: Floats
-    rotation: Floats
-    length: Floats
-
-
-def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bools]:
-    """Positions (n, d), rotations (n, d, d) and which are known (n,), along the shortest paths from the roots."""
+def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
+    """Positions (n, d), rotations (n, d, d) and which are known (n,), along the shortest paths from the roots by the
+    `used` relative poses, whose length is their variance."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
+    edges, n, d = graph.relative_pose, len(graph.names), graph.dimension
     position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
     is_reached = np.zeros(n, dtype=bool)
-    which = np.argsort(moves.length, kind="stable")
-    ends = np.stack([moves.nodes[which], moves.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
+    length, rows = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12, np.flatnonzero(used)
+    which = rows[np.argsort(length[rows], kind="stable")]
+    ends = np.stack([edges.nodes[which], edges.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
     key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
     edge, forward = which[first // 2], first % 2 == 0
-    graph = csr_array((moves.length[edge], key % n, np.searchsorted(key, n * np.arange(n + 1))), shape=(n, n))
+    lengths = csr_array((length[edge], key % n, np.searchsorted(key, n * np.arange(n + 1))), shape=(n, n))
     for root, at, turned in roots:
         if is_reached[root]:
             continue
-        distance, before = dijkstra(graph, indices=root, return_predecessors=True)
+        distance, before = dijkstra(lengths, indices=root, return_predecessors=True)
         reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
         before = before.astype(np.int64)  # SciPy's 32 bits hold no product of two numbers beyond 46,340
-        used = np.searchsorted(key, before[reached] * n + reached)
-        moved, turn = moves.position[edge[used]], moves.rotation[edge[used]]
+        taken = np.searchsorted(key, before[reached] * n + reached)
+        moved, turn = edges.position[edge[taken]], edges.rotation[edge[taken]]
         back = np.swapaxes(turn, 1, 2)
-        turn = np.where(forward[used, None, None], turn, back)
-        moved = np.where(forward[used, None], moved, -(back @ moved[..., None])[..., 0])
+        turn = np.where(forward[taken, None, None], turn, back)
+        moved = np.where(forward[taken, None], moved, -(back @ moved[..., None])[..., 0])
         index = np.full(n, -1)
         index[reached] = np.arange(len(reached))
         before = index[before[reached]]
@@ -100,7 +94,7 @@ def parts(n: int, *joined: Ints) -> Ints:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    pairs = np.concatenate([np.empty((0, 2), np.int64), *joined])
+    pairs = stacked(joined, 2)
     part: Ints = connected_components(csr_array((np.ones(len(pairs)), pairs.T), (n, n)), directed=False)[1]
     return part
 
@@ -152,7 +146,7 @@ def _squares(places: Floats, ranges: Floats, at: Floats) -> Floats:
 def chained(graph: Graph) -> Floats:
     """(n, ambient): each robot's poses along its own relative poses, from a pose with a prior, else from its first
     vertex in the file; where the file has none, from a place on a ring."""
-    return with_points(graph, *walked(graph, _own(graph), _roots(graph)))
+    return with_points(graph, *walk(graph, _own(graph), _roots(graph)))
 
 
 def tree(graph: Graph) -> Floats:
@@ -168,11 +162,9 @@ def tree(graph: Graph) -> Floats:
         and accurate approximation for planar pose graph optimization, IJRR 2014.
     """
     edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph)
-    position, rotation, reached = walked(graph, np.ones(len(edges), dtype=bool), roots)
-    if len(edges) >= len(rotation) or len(edges) > int(reached.sum()) - len(
-        np.unique(parts(len(reached), edges.nodes))
-    ):
-        (i, j), part = edges.nodes.T, parts(len(rotation), edges.nodes)
+    position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
+    (i, j), part = edges.nodes.T, parts(len(rotation), edges.nodes)
+    if len(edges) >= reached.sum() - part.max():
         still = np.unique(part, return_index=True)[1]
         for root, _, _ in reversed(roots):
             still[part[root]] = root
@@ -252,7 +244,7 @@ def unwound(graph: Graph, x: Floats) -> bool:
     error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
     if graph.dimension == 3:
         return bool(np.linalg.norm(error, axis=1).sum() < np.pi)
-    tree = walked(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
+    tree = walk(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
     along = log(np.swapaxes(tree, 1, 2) @ turned)  # more than half a turn of it shows as a jump on an edge
     return bool(np.abs(along[i] + error - along[j]).max() < WOUND)
 
@@ -292,14 +284,6 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
             at[:2] = around * np.cos(angle), around * np.sin(angle)
             roots.append((node, at, np.eye(graph.dimension)))
     return roots
-
-
-def walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
-    """The walk along the `used` relative poses, whose length is their variance."""
-    edges = graph.relative_pose
-    length = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12 if len(edges) else np.empty(0)
-    moves = Moves(edges.nodes[used], edges.position[used], edges.rotation[used], length[used])
-    return walk(len(graph.names), graph.dimension, moves, roots)
 
 
 def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
@@ -349,8 +333,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
                 x[places[len(old) :]] = carried(space, problem.x0[places[len(old) :]], problem.x0[old[-1]], x[old[-1]])
         joins = np.zeros(n, dtype=bool)
         for edges in (graph.relative_point, graph.point_prior):
-            if len(edges):
-                joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
+            joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
         for point in np.flatnonzero(~graph.is_pose & ~joins).tolist():
             others, distance = _ranged(graph, point, used)
             joins[point] = len(others) >= HOLDING * space.dimension + 1

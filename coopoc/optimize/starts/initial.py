@@ -4,28 +4,17 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..algebra.sparse import Sparse, sparse
-from ..model.derivatives import Model
+from ..algebra.sparse import sparse
 from ..model.factor import Factor, unchecked
-from ..model.measurements import columns, converted_rows, is_converted
+from ..model.measurements import CONVERTED, converted_rows
 from ..model.problem import Problem
 
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
 
 
-def converted(problem: Problem) -> Problem:
-    """The linear problem: spherical factors become vectors d u with the rotated covariance; other angles are left out.
-
-    d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
-    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
-    """
-    factors = [as_vectors(f) if is_converted(f.measurement) else unchecked(f, loss=None) for f in problem.factors]
-    return problem.replace_unchecked(factors=tuple(f for f in factors if f.measurement.linear), x0=None, fixed=())
-
-
 def initial_guess(problem: Problem) -> Floats:
-    """(n, ambient): x0 if the problem has one, else the solution of `converted`.
+    """(n, ambient): x0 if the problem has one, else the linear solution of vectors, see `as_vectors`.
 
     Raises:
         InputError: poses without an x0.
@@ -39,18 +28,13 @@ def guessed(problem: Problem) -> tuple[Floats, bool]:
         return problem.x0.copy(), True
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give coopoc.optimize.pose(position, angle).")
-    x, touched = _solution(sparse(problem), "converted")
-    return (x if touched else _apart(problem, x)), touched
-
-
-def _solution(system: Sparse, model: Model) -> tuple[Floats, bool]:
-    """(n, d) where a quadratic cost of points is least, and whether every point has a part in it."""
-    zero = np.zeros(system.entries.number.shape)
-    _, gradient, values = system.quadratic(zero, model)
+    system, zero = sparse(problem), np.zeros((len(problem.names), problem.dimension))
+    _, gradient, values = system.quadratic(zero, "converted")
     own = values[system.entries.diagonal]
     values[system.entries.diagonal] = own + RIDGE
     system.cholesky.factor(values)
-    return system.retract(zero, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
+    x, touched = system.retract(zero, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
+    return (x if touched else _apart(problem, x)), touched
 
 
 def somewhere(problem: Problem) -> Floats:
@@ -74,9 +58,8 @@ def _apart(problem: Problem, x: Floats) -> Floats:
     """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
     touched = np.zeros(len(x), dtype=bool)
     for f in problem.factors:
-        if not (f.measurement.linear or is_converted(f.measurement)):
-            continue
-        touched[f.nodes[f.informative]] = True
+        if f.measurement.linear or f.kind == CONVERTED:
+            touched[f.nodes[f.informative]] = True
     ranges = [f.z[:, 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
     index = np.cumsum(~touched) - 1
     turn, radius = 2.4 * index, np.sqrt(1.0 + index) * (ranges[0] if ranges else 1.0)
@@ -87,8 +70,12 @@ def _apart(problem: Problem, x: Floats) -> Floats:
 
 
 def as_vectors(factor: Factor) -> Factor:
-    """A spherical factor as one of vectors."""
-    d, rows = converted_rows(columns(factor.z), np)
+    """A spherical factor as one of vectors d u with the rotated covariance.
+
+    d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
+    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
+    """
+    d, rows = converted_rows([*factor.z.T], np)
     inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     z, nothing = d[:, None] * inverse[:, 0], np.empty((len(factor.nodes), 0))
     root = factor.root @ inverse

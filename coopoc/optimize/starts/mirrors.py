@@ -8,8 +8,9 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..assess.assess import squared
-from ..model.factor import Factor, Loss
+from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
+from ..model.space import nearest_rotation
 from .graph_starts import parts
 
 RANGES = "range", "range_offset"
@@ -60,14 +61,8 @@ def ranges_of(problem: Problem, x: Floats) -> Ranges:
     """All ranges of a problem that have weight; offsets are those of x (n, ambient)."""
     factors = [f for f in problem.factors if f.kind in RANGES]
     own = np.repeat(np.arange(len(factors)), [len(f.nodes) for f in factors])
-    nodes = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes[:, :2] for f in factors)])
-    distance, weight = (
-        np.concatenate([np.empty(0), *parts_])
-        for parts_ in (
-            [f.z[:, 0] - x[f.nodes[:, 2:], 0].sum(axis=1) for f in factors],
-            [f.root[:, 0, 0] for f in factors],
-        )
-    )
+    distance = stacked(f.z[:, 0] - x[f.nodes[:, 2:], 0].sum(axis=1) for f in factors)
+    nodes, weight = stacked((f.nodes[:, :2] for f in factors), 2), stacked(f.root[:, 0, 0] for f in factors)
     return Ranges(nodes, distance, weight, tuple((own == k, f.loss) for k, f in enumerate(factors)))
 
 
@@ -86,18 +81,14 @@ def bodies(problem: Problem, x: Floats) -> list[Ints]:
     vague = RANGES + LEVEL * (problem.dimension == 3)
     others = [f.nodes[f.informative] for f in problem.factors if f.kind not in vague]
     part = parts(len(problem.names), *(n[:, k : k + 2] for n in others for k in range(n.shape[1] - 1)))
-    held = np.concatenate([np.array(problem.fixed, np.int64), *(_accepted(problem, f, x) for f in problem.factors)])
-    loose = np.setdiff1d(part, part[held])
-    order = np.argsort(part, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
-    return [group for group in groups if part[group[0]] in loose]
+    alone = (_accepted(problem, f, x) for f in problem.factors if f.nodes.shape[1] == 1)
+    held = np.concatenate([np.array(problem.fixed, np.int64), *alone])
+    return [np.flatnonzero(part == body) for body in np.setdiff1d(part, part[held])]
 
 
 def _accepted(problem: Problem, factor: Factor, x: Floats) -> Ints:
     """Nodes that a factor of one node each holds at x."""
     kept = factor.informative
-    if factor.nodes.shape[1] > 1:
-        return np.empty(0, np.int64)
     if factor.loss is not None:
         kept = kept & (squared(problem, factor, x) <= factor.loss.scale**2)
     return np.asarray(factor.nodes[kept, 0])
@@ -114,7 +105,7 @@ def scaled(problem: Problem, x: Floats) -> Floats:
 
     ranges, (n, d) = ranges_of(problem, x), x.shape
     moved = [f for f in problem.factors if f.kind == "displacement"]
-    loose = np.concatenate([np.empty(0, np.int64), *bodies(problem, x)])
+    loose = stacked(bodies(problem, x))
     if n > LARGEST or not len(loose) or not len(ranges.nodes):
         return x
     table = np.full((n, n), np.inf)
@@ -177,10 +168,9 @@ def _mirrored(problem: Problem, nodes: Floats, plane: tuple[Floats, Floats]) -> 
     space = problem.space
     at = space.position(nodes)
     image = _image(at, plane)
-    left, _, right = np.linalg.svd((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
-    turn = left @ np.diag([*np.ones(problem.dimension - 1), np.linalg.det(left @ right)]) @ right
+    turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
     moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
-    return space.join(moved, turn @ space.rotation(nodes)) if space.has_rotation else moved
+    return space.join(moved, turn @ space.rotation(nodes))
 
 
 def _all_mirrored(problem: Problem, ranges: Ranges, x: Floats, loose: list[Ints]) -> Iterator[Floats]:
@@ -318,15 +308,8 @@ def regrown(problem: Problem, x: Floats) -> Floats:
     d, n, x = problem.dimension, len(x), x.copy()
     places, ranges = x[:, :d], ranges_of(problem, x)
     fixes = [f for f in problem.factors if f.kind == "position"]
-    fixed, fix, root, known = (
-        np.concatenate([empty, *parts_])
-        for empty, parts_ in (
-            (np.empty(0, np.int64), [f.nodes[:, 0] for f in fixes]),
-            (np.empty((0, d)), [f.z for f in fixes]),
-            (np.empty((0, d, d)), [f.root for f in fixes]),
-            (np.empty(0, bool), [np.full(len(f.z), f.loss is None) for f in fixes]),
-        )
-    )
+    fixed, fix = stacked(f.nodes[:, 0] for f in fixes), stacked((f.z for f in fixes), d)
+    root, known = stacked((f.root for f in fixes), d, d), stacked(np.full(len(f.z), f.loss is None) for f in fixes)
 
     def agree(at: Floats, rows: Ints, others: Ints, own: Ints) -> tuple[Bools, Bools]:
         """Whether ranges (K,) to others and fixes (F,) fit places (C, d): (C, K), (C, F)."""

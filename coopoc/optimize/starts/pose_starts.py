@@ -9,10 +9,10 @@ from ...arrays import Floats
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
 from ...world.links import wrap
-from ..model.factor import Factor, fused, taken
+from ..model.factor import Factor, fused, stacked, taken
 from ..model.problem import Problem
 from ..model.space import Space, exp
-from .graph_starts import parts, trilaterate, walked, with_points
+from .graph_starts import parts, trilaterate, walk, with_points
 from .initial import as_vectors, initial_guess
 from .mirrors import ranges_of
 
@@ -73,7 +73,7 @@ def along_poses(problem: Problem) -> Floats:
     """
     graph, space, x = graph_of(problem), problem.space, initial_guess(problem)
     roots = [(k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses)]
-    position, rotation, placed = walked(graph, np.ones(len(graph.relative_pose), dtype=bool), roots)
+    position, rotation, placed = walk(graph, np.ones(len(graph.relative_pose), dtype=bool), roots)
     position[~placed], rotation[~placed] = space.position(x[~placed]), space.rotation(x[~placed])
     placed[list(problem.fixed)] = True
     return with_points(graph, position, rotation, placed)[:, : space.ambient]
@@ -107,14 +107,13 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
     joined = [f.nodes[f.informative] for f in problem.factors if _field(f).startswith("relative")]
     part, ranges = parts(len(x), *joined), ranges_of(problem, x)
     fixes = [taken(f, np.flatnonzero(f.informative)) for f in problem.factors if f.kind == "position"]
-    fixed = np.concatenate([np.empty(0, np.int64), *(f.nodes[:, 0] for f in fixes)])
-    fix = np.concatenate([np.empty((0, d)), *(f.z for f in fixes)])
-    weight = np.concatenate([np.empty(0), *(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in fixes)])
+    fixed, fix = stacked(f.nodes[:, 0] for f in fixes), stacked((f.z for f in fixes), d)
+    weight = stacked(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in fixes)
     held = [part[f.nodes[:, 0]] for f in problem.factors if f.kind.startswith("pose")]
     known, single = np.isin(part, np.concatenate([[-1], *held])), np.bincount(part)[part] == 1
     aims = [f for f in problem.factors if f.kind == "bearing"]
-    aimed = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes for f in aims)])
-    angle, sure = np.concatenate([np.empty((0, 2)), *(np.column_stack([f.z[:, 0], f.root[:, 0, 0]]) for f in aims)]).T
+    aimed = stacked((f.nodes for f in aims), 2)
+    angle, sure = stacked(f.z[:, 0] for f in aims), stacked(f.root[:, 0, 0] for f in aims)
     here = (single & ~known)[fixed]
     x[fixed[here], :d], known[fixed[here]] = fix[here], True
     while not known.all():

@@ -9,7 +9,7 @@ from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
-from ..model.factor import Factor, taken, unchecked
+from ..model.factor import reweighed, taken
 from ..model.problem import Problem, Search
 from .mirrors import RANGES, across, regrown, scaled
 
@@ -66,17 +66,23 @@ def race(
         grown: which of the late starts is tried first where no other went straight.
         draws: whether points are started from random places, too.
     """
-    system, tried, taken, calm = sparse(problem), {}, 0, list[float]()
+    system, taken, arrived = sparse(problem), 0, True
+    tried, calm, straight, minima = dict[str, tuple[float, Floats]](), list[float](), set[str](), list[float]()
     mean, variance = expected(problem, system.size)
     usual = EXCESS * np.sqrt(variance)
-    limit, straight, arrived = mean + usual, set[str](), True
-    minima = list[float]()
+    limit = mean + usual
 
     def descend(x: Floats, steps: int = MORE) -> Floats:
         nonlocal taken, arrived
         end = arrive(system, x, steps, TOLERANCE)
         taken, arrived = taken + end.iterations, end.converged
         return end.x
+
+    def attempt(name: str, x: Floats, steps: int, smooth: bool = False) -> Arrival:
+        nonlocal taken
+        end = arrive(system, x, steps, TOLERANCE, smooth=smooth)
+        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
+        return end
 
     def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
@@ -109,13 +115,11 @@ def race(
 
     late, rough = dict(late), list[str]()
     for name, start in starts.items():
-        x = start()
-        end = arrive(system, x, STEPS, TOLERANCE, smooth=True)
-        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
+        end, cost = attempt(name, start(), STEPS, True), tried[name][0]
         if not smooth(end):
             rough.append(name)
         else:
-            cost, calm = tried[name][0], [*calm, tried[name][0]]
+            calm.append(cost)
             alike = sum(abs(cost - other) <= SAME * cost for other in calm) > 1
             if (cost <= limit and alike) or (cost <= ROUNDS[0][0] * limit and unwound(end.x)):
                 return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME * cost))
@@ -127,8 +131,7 @@ def race(
         if explained(y):
             return ended(grown, y)
     for name in rough:
-        end = arrive(system, tried[name][1], STEPS, TOLERANCE)
-        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
+        attempt(name, tried[name][1], STEPS)
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
     for within, steps in ROUNDS:
@@ -137,11 +140,10 @@ def race(
         tried = _distinct(tried)
         close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
         if len(close) > 1:
-            ends = {name: arrive(system, x, steps, TOLERANCE) for name, x in close.items()}
-            tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
-            taken += sum(end.iterations for end in ends.values())
+            tried.clear()
+            ends = [attempt(name, x, steps) for name, x in close.items()]
             reached |= {name: cost for name, (cost, _) in tried.items()}
-            minima = [cost for name, (cost, _) in tried.items() if ends[name].converged]
+            minima = [cost for (cost, _), end in zip(tried.values(), ends, strict=True) if end.converged]
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
     if name not in straight and not explained(x) and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1:
@@ -180,9 +182,8 @@ def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
     at first odometry decides, and what ranges alone place is mirrored before they bend it."""
     x, taken = start, 0
     for times in EASED:
-        part = problem.replace_unchecked(
-            factors=tuple(weaker(f, times) if f.kind in RANGES else f for f in problem.factors)
-        )
+        factors = (reweighed(f, 1.0 / times) if f.kind in RANGES else f for f in problem.factors)
+        part = problem.replace_unchecked(factors=tuple(factors))
         system = sparse(part)
 
         def descend(y: Floats, system: Sparse = system) -> Floats:
@@ -193,13 +194,6 @@ def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
 
         x = across(part, descend(x), descend, system.cost)[0]
     return x, taken
-
-
-def weaker(factor: Factor, times: float) -> Factor:
-    """A factor with standard deviations that are `times` as large."""
-    if factor.std is not None:
-        return unchecked(factor, std=factor.std * times)
-    return unchecked(factor, sqrt_information=np.asarray(factor.sqrt_information) / times)
 
 
 def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:
