@@ -26,11 +26,13 @@ from .gaussian import (
     Rows,
     clear,
     insert,
+    insert_error,
     new_gaussian,
     new_rows,
     remove,
     widen,
 )
+from .messages import vector_at
 
 FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, OWN = 0, 3, 6, 9, 12, 13, 16, 17
 """Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
@@ -45,42 +47,17 @@ motion with it m^2, when that was s (-inf for never), how many in a row were not
 share of what is assumed the variance of its velocities is more."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
-SLIPPED, WILD = 5.0, 32.0
-"""Implausible velocities in a row after which one counts again, and the squared normalised distance from which a
-velocity is, or an error of fixes, beyond doubt."""
+WILD = 32.0
+"""Squared normalised distance from which a velocity is implausible, or an error of fixes beyond doubt."""
 ESTABLISHED, LONGEST = 60.0, 0.99 * PATIENCE
 """s of agreement with fixes after which a position was no wrong start, and its count of lock-out at which fixes that
 contradict it are taken for noisier ones: it is not left."""
-CHANGES, WIDEST = 20.0, 9.0
-"""Velocities in the level of their noise, fewer at first, and the most of a squared normalised change that counts."""
-
-
-TAU, SHARE = 20.0, 0.1
-"""m, standard deviation of an error of a receiver of which nothing is known, and the prior share of vehicles with one:
-of 0.05 to 0.3 no world is told apart."""
-SURE, PENALTY, REVOKE = 2.0, 4.0, 2.0
-"""Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
-WINDOW, CONTRADICTED = 30.0, 30.0
-"""Fixes in the mean innovation of a vehicle; steps in a row at most after which a member that is contradicted joins
-anew."""
+TAU = 20.0
+"""m, standard deviation of an error of a receiver of which nothing is known."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
 FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 13
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
-
-
-class Sent(NamedTuple):
-    """What is in the messages; arrays are broadcastable to (N, R, T, 3), the vehicles first.
-
-    Attributes:
-        position: m, and
-        variance: m^2, as `fading_memory` writes them.
-        odometer: m, sum of all motions until each step.
-    """
-
-    position: Floats
-    variance: Floats
-    odometer: Floats
 
 
 class Model(NamedTuple):
@@ -229,26 +206,12 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
     f.ego[LEFT + 3] = NOTHING
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
-    insert(f.g, 0, PLACE, 0.0)
-    if model.common > 0.0:
-        insert(f.g, 0, COMMON, model.common)
-    if model.bias + model.heading + model.offset > 0.0:
-        first = insert(f.g, 0, COMPASS, model.bias)
-        f.g.p[first + 2, first + 2] = model.offset
-    if model.ranged[0] > 0.0:
-        first = insert(f.g, 0, RANGED, 0.0)
-        f.g.p[first, first] = model.ranged[0]
-    insert_turn(f.g, model, 0)
+    insert(f.g, 0, PLACE)
+    insert_error(f.g, 0, COMMON, (model.common, model.common, model.common))
+    insert_error(f.g, 0, COMPASS, (model.bias, model.heading, model.offset))
+    insert_error(f.g, 0, RANGED, (model.ranged[0], 0.0, 0.0))
+    insert_error(f.g, 0, TURN, vector_at(model.turn, 0))
     start(f, model, own, rows, count)
-
-
-@part
-def insert_turn(g: Gaussian, model: Model, k: int) -> None:
-    """Give a member errors of heading and scale of its odometry, and of its clock, where there are any."""
-    if model.turn[0] + model.turn[1] + model.turn[2] > 0.0:
-        i = insert(g, k, TURN, 0.0)
-        for c in range(3):
-            g.p[i + c, i + c] = model.turn[c]
 
 
 @part
@@ -282,8 +245,7 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     clear(g, 0)
     remove(g, 0, ERROR)
-    if model.own > 0.0:
-        insert(g, 0, ERROR, model.own)
+    insert_error(g, 0, ERROR, (model.own, model.own, model.own))
     for c in range(3):
         g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
         f.ego[LEFT + c] += own[MOTION + c]
@@ -338,7 +300,8 @@ def reset_bias(f: Filter, model: Model, j: int) -> None:
         f.status[j, MEAN + c] = 0.0
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
-        insert(f.g, f.slot[j], ERROR, TAU**2 + model.own)
+        variance = TAU**2 + model.own
+        insert_error(f.g, f.slot[j], ERROR, (variance, variance, variance))
 
 
 @part

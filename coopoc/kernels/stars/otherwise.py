@@ -92,7 +92,7 @@ from .gaussian import (
     Q,
     Rows,
     has,
-    shift,
+    stretch,
     widen,
 )
 
@@ -135,7 +135,7 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     for j in range(n):
         for c in range(2):
             g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
-    shift(g, i, i, keep - 1.0)
+    stretch(g, i, keep - 1.0)
     for c in range(3):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
 
