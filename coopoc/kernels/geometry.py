@@ -160,19 +160,13 @@ def metres(polar: Numbers, std: Numbers | Floats, least: float) -> Numbers:
     return std[0], std[1] * level * reach, std[2] * reach
 
 
-@inside
-def information(polar: Numbers, std: Numbers, unit: bool, least: float) -> Numbers:
-    """C^-1 of a vector converted from range and angles, at the geometry `polar`; `unit`: 1 m along each axis."""
-    a, b, c = std if unit else metres(polar, std, least)
-    return spread(polar, 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c))
-
-
 @inner
 def converted(gap: Numbers, measured: Numbers, unit: bool, least: float) -> tuple[Numbers, Numbers]:
-    """C^-1 and C^-1 (measured vector - gap), weighted by the geometry of the vector `gap`; components that are missing
-    are those of `gap`."""
+    """C^-1 and C^-1 (measured vector - gap), weighted by the geometry of the vector `gap`, or by 1 m along each axis if
+    `unit`; components that are missing are those of `gap`."""
     polar = direction(gap[0], gap[1], gap[2])
-    weight = information(polar, measured[5:], unit, least)
+    a, b, c = measured[5:] if unit else metres(polar, measured[5:], least)
+    weight = spread(polar, 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c))
     return weight, apply(weight, subtract(vector(completed(measured, polar)), gap))
 
 

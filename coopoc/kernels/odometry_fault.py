@@ -196,14 +196,13 @@ def correct_drives(
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle, which begins anew.
         fresh: of `new_state`.
-        variance: (3,) m^2 of a fix.
+        variance: (N, 3) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
-        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
-            length only to ask.
+        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2.
     """
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)
-    r, fails = 0.5 * (variance[0] + variance[1]), False
+    fails = False
     for run in range(gnss.shape[0]):
         for e in range(len(columns)):
             for i in range(SIZE):
@@ -217,9 +216,9 @@ def correct_drives(
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)
+                r = 0.5 * (variance[n, 0] + variance[n, 1])
                 extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
-                if len(out):
-                    out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
-                    out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
+                out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
+                out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
     return fails

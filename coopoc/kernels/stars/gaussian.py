@@ -358,10 +358,10 @@ def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> N
 
 @part
 def distance(s: tuple[float, ...], x: tuple[float, ...]) -> tuple[float, float]:
-    """x^T S^-1 x of a symmetric 3 x 3 matrix S, and its determinant."""
+    """x^T S^-1 x of a symmetric 3 x 3 matrix S, also where x and S have no height, and its determinant."""
     a, b = s[3] / s[0], s[6] / s[0]
     d, cross = s[4] - a * s[3], s[7] - b * s[3]
     c = cross / d
     e, y = s[8] - b * s[6] - c * cross, x[1] - a * x[0]
     z = x[2] - b * x[0] - c * y
-    return x[0] * x[0] / s[0] + y * y / d + z * z / e, s[0] * d * e
+    return x[0] * x[0] / s[0] + y * y / d + (z * z / e if z != 0.0 else 0.0), s[0] * d * e

@@ -47,7 +47,7 @@ def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
             star, before = before, star
             n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, model, n, old)
-            write(out, joint, first, last, t, measurements.start[t], n)
+            write(out, joint.state, joint.scratch, first, last, t, measurements.start[t], n)
             old = n
     return out
 
@@ -95,7 +95,9 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
         store(joint.eta, i, subtract(vector_at(joint.eta, i), scale(gaps, row * central)))
         for j in range(i, n):
             other = count if j == e else -edge_to(star, joint, j + 1)[0]
-            add_at(joint, i * stride + j, central * row * other)
+            at, number = i * stride + j, central * row * other
+            block = add_diagonal(block_at(joint.information, at), (number, number, number))
+            store(joint.information, at, block)
 
 
 @inside
@@ -105,10 +107,3 @@ def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     edge = whole(polar)
     gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
     return edge, scale(gap, edge)
-
-
-@inside
-def add_at(joint: Joint, at: int, number: float) -> None:
-    """Add to the diagonal of a block."""
-    block = block_at(joint.information, at)
-    store(joint.information, at, add_diagonal(block, (number, number, number)))

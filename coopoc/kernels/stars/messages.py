@@ -217,7 +217,8 @@ def gather(
             run = min(first + int(lane), last)
             receive(star, before, measurements, model, run, t, link, k, lane)
             if k > 0:
-                measured(star.relative, measurements.relative[run, link], model.relative_std, k, lane)
+                std = model.relative_std if len(model.relative_std) else UNIT
+                put_lane(star.relative, 8 * k, lane, with_std(measurements.relative[run, link], std))
         interpret(star, model, k, measurements.dt)
     return int(n)
 
@@ -292,12 +293,6 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
     store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
     store(star.motion, 4 * k + POSITION, add(position_of(star, k), scale(moved, age)))
     store(star.motion, 4 * k + VARIANCE, add(variance_of(star, k), grown))
-
-
-@inside
-def measured(relative: Floats, measured: Floats, std: Floats, k: int, lane: int) -> None:
-    """Copy the measurement of member k, of `components`, with its standard deviations."""
-    put_lane(relative, 8 * k, lane, with_std(measured, std if len(std) else UNIT))
 
 
 @inside
