@@ -161,7 +161,7 @@ class NoiseModel:
 
     def fix_scale(self, recording: Recording) -> Floats:
         """(N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
-        return recording.fix_scale if recording.fix_factor and self.sensors is not None else np.ones((1, 1))
+        return np.ones((1, 1)) if self.sensors is None else recording.fix_scale
 
     @property
     def gnss_variance(self) -> Floats:

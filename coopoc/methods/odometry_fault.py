@@ -30,8 +30,7 @@ def with_odometry(
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh, found = new_state(motion_noise(noise_model, recording.dt)), np.zeros(velocity.shape)
-    scale = np.ones((len(recording.ids), 1)) * noise_model.fix_scale(recording)
-    variance = scale**2 * (fix**2 * noise_model.gnss_variance)
+    variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)
     if not correct_drives(gnss, velocity, fresh, variance, columns, recording.dt, found):
         return recording, noise_model
     velocity, extra = velocity.copy(), found[..., 2]

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -193,13 +192,21 @@ class StarStream:
         """
         names = names_of("neighbours", neighbours, RelativeMeasurement)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
-        columns, time, motion, fix = self._columns(names), self._time + float(dt), self._motion, self._fix
+        columns, own, time = self._columns(names), np.empty(OWN), self._time + float(dt)
         rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
-        own, history, last = np.empty(OWN), self.history.reserve(), self._last
-        own_memory, oldest = self._memory, self.max_age
-        state = self._odometry
         outcome = stream_rows(
-            self._given, history, motion, fix, state, own, rows, columns, last, time, oldest, own_memory
+            self._given,
+            self.history.reserve(),
+            self._motion,
+            self._fix,
+            self._odometry,
+            own,
+            rows,
+            columns,
+            self._last,
+            time,
+            self.max_age,
+            self._memory,
         )
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
@@ -213,13 +220,10 @@ class StarStream:
 
     def _columns(self, names: list[str]) -> Ints:
         """Numbers of the vehicles, 1 and up; the filter has room for them."""
-        try:
-            columns = np.fromiter(map(self._numbers.__getitem__, names), np.int64, len(names))
-        except KeyError:
-            self._meet([name for name in names if name not in self._numbers], names)
-            return self._columns(names)
+        if new := [name for name in names if name not in self._numbers]:
+            self._meet(new, names)
         self._reserve(1 + len(names), len(self._last))
-        return columns
+        return np.array([self._numbers[name] for name in names], np.int64)
 
     def _meet(self, new: list[str], names: list[str]) -> None:
         """Number new vehicles; forget those that are in no star that is remembered, and whose messages are too old."""
@@ -242,16 +246,7 @@ class StarStream:
 
     def _reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""
-        before = self._filter
+        before, tries = self._filter, self._tries
         if slots > len(before.who) or vehicles > len(before.slot):
-            self._copy(max(len(before.who), 2 * slots), vehicles)
-
-    def _copy(self, slots: int, vehicles: int) -> None:
-        before = self._filter, self._tries
-        self._filter, self._tries = make_filter(slots, vehicles)
-        restore(*before, self._filter, self._tries)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Arrays that share memory have come apart in the pickle."""
-        self.__dict__.update(state)
-        self._copy(len(self._filter.who), len(self._filter.slot))
+            self._filter, self._tries = make_filter(max(len(before.who), 2 * slots), vehicles)
+            restore(before, tries, self._filter, self._tries)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -183,12 +183,10 @@ def silent_track(
     cov: Floats | None,
     began: float,
     notes: tuple[str, ...],
-    **more: Any,
 ) -> Track:
     """Track of a method that receives and sends nothing."""
     none = np.zeros((recording.runs, len(columns)))
-    took, notes = clock() - began, (*dict.fromkeys(notes + recording.unlikely),)
-    return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
+    return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
 
 @runtime_checkable
