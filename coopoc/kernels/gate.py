@@ -55,15 +55,13 @@ def inflation(q: float, gate: float, hits: float) -> float:
     So the influence of an innovation falls as 1 / sqrt(q), and ends.
     """
     share = choose(q - HARD_REJECT_FACTOR * gate, math.inf, max(q / gate, 1.0))
-    counts: float = choose(PATIENCE - hits, share, 1.0)
-    return counts
+    return choose(PATIENCE - hits, share, 1.0)
 
 
 @inside
 def count(q: float, gate: float, hits: float, gain: float) -> float:
     """Next value of the lock-out counter: the gains of measurements beyond the gate, less LEAK of those within."""
-    more: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
-    return more
+    return choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
 
 
 @inside

@@ -97,8 +97,7 @@ def series(sine: float, cosine: float) -> float:
     s = t * t
     tail = less(1 / 17, s, less(1 / 19, s, less(1 / 21, s, less(1 / 23, s, 1 / 25))))
     tail = less(1 / 9, s, less(1 / 11, s, less(1 / 13, s, less(1 / 15, s, tail))))
-    small: float = t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
-    return small
+    return t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
 
 
 @inner
@@ -146,8 +145,7 @@ def spread(polar: Numbers, a: float, b: float, c: float) -> Numbers:
     _, sa, ca, si, ci = polar
     flat, cross = plus(a * si * si, c * ci, ci), (a - c) * si * ci
     xx, yy, zz = plus(flat * ca * ca, b * sa, sa), plus(flat * sa * sa, b * ca, ca), plus(a * ci * ci, c * si, si)
-    whole: Numbers = from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
-    return whole
+    return from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
 
 
 @inside
@@ -195,8 +193,7 @@ def exact(gap: Numbers, measured: Numbers, least: float) -> tuple[Numbers, Numbe
 @inside
 def missing(measured: Numbers) -> float:
     """Positive where a component is missing, else negative."""
-    lacks: float = measured[5] + measured[6] + measured[7] - (0.0 * measured[0] + 1e300)
-    return lacks
+    return measured[5] + measured[6] + measured[7] - (0.0 * measured[0] + 1e300)
 
 
 @inside
@@ -209,8 +206,7 @@ def incomplete(measured: Numbers) -> bool:
 def whole(measured: Numbers) -> float:
     """1 where all components were measured, else 0."""
     o = 0.0 * measured[0]
-    share: float = choose(missing(measured), o, o + 1.0)
-    return share
+    return choose(missing(measured), o, o + 1.0)
 
 
 @inner

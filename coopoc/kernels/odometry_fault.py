@@ -81,10 +81,8 @@ def correct(state: Floats, velocity: Floats, dt: float) -> float:
         return 0.0
     velocity[0] += state[ERROR]
     velocity[1] += state[ERROR + 1]
-    more: float = (
-        2.0 * dt * state[VARIANCE + 1] + dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2] + JERKY * dt**3 / 3.0
-    )
-    return more
+    grown = dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2]
+    return 2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0
 
 
 @part
@@ -116,7 +114,7 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     gather_evidence(state, r / state[COUNT], dt)
     if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < LONG:
         return 0.0
-    gap2: float = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
+    gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
     least = max(SHARE * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
     if min(gap2, size2) < least * least:

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, Ints, instance, refuse
-from ..errors import InputError
+from ..errors import InputError, shown
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.geometry import components
 from ..kernels.motion import MotionNoise
@@ -33,7 +34,7 @@ from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_st
 from ..world.links import drop_steep_azimuths
 from ..world.plausible import FARTHEST, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
-from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .motion_history import MotionHistory, fix_or_none, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
 
 FIRST = np.zeros(1, np.int64)
@@ -90,6 +91,17 @@ class RelativeMeasurement:
             allowed = f"of {self.id} must hold position, velocity, variance and odometer"
             raise InputError("message", "a part of one", allowed, "Send stream.broadcast.")
         self.__dict__["row"] = row.tobytes()
+
+
+def _names(neighbours: Any) -> list[str]:
+    """Names of the neighbours of a step; InputError for anything but measurements of them, or for one twice."""
+    if not isinstance(neighbours, Sequence) or not all(isinstance(each, RelativeMeasurement) for each in neighbours):
+        hint = "Give a list of RelativeMeasurement, empty for none."
+        raise InputError("neighbours", shown(neighbours), "must hold RelativeMeasurements", hint)
+    names = [each.id for each in neighbours]
+    if len(set(names)) < len(names):
+        raise InputError("neighbours", names, "must be given once each", "Merge the measurements of one vehicle.")
+    return names
 
 
 class StarStream:
@@ -190,7 +202,7 @@ class StarStream:
         Raises:
             InputError: as `FilterStream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
-        names = names_of("neighbours", neighbours, RelativeMeasurement)
+        names = _names(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         columns, own, time = self._columns(names), np.empty(OWN), self._time + float(dt)
         rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)

@@ -90,7 +90,7 @@ from .gaussian import (
     widen,
 )
 from .lasting import add_lasting, remember_error
-from .messages import Assumptions, Measurements, largest, three_of, vector_at
+from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
     ALONE,
     ALONE_FOR,
@@ -118,6 +118,7 @@ from .otherwise import (
     copy_rows,
     corrected,
     corrected_motion,
+    ego_variance,
     gap_to_fix,
     learn_fix,
     learn_relative,
@@ -150,18 +151,13 @@ def run_filter(
         model: noise model.
     """
     runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
-    most, of_ego = largest(measurements.start), np.full((runs, steps, FOUND + 13), math.nan)
+    most, of_ego = measurements.most, np.full((runs, steps, FOUND + 13), math.nan)
     by_link = np.full((runs, measurements.relative.shape[1], 9), math.nan)
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f, tries = new_filter(most, vehicles), new_tries(most, vehicles)
         for t in range(steps):
-            first = measurements.start[t]
-            count = measurements.start[t + 1] - first
-            gather_own(own, measurements, assumed, odometry, model.white, run, t)
-            for i in range(count):
-                who[i] = measurements.neighbour[first + i]
-                gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
+            count = gather(own, rows, who, measurements, assumed, sent, odometry, model.white, run, t)
             if f.g.vectors[0] == 0:
                 if not is_placed(own, rows, count):
                     continue
@@ -171,7 +167,7 @@ def run_filter(
             for i in range(FOUND + 12):
                 of_ego[run, t, 1 + i] = f.ego[TOLD + i]
             for i in range(count):
-                k, answer = f.slot[who[i]], by_link[run, first + i]
+                k, answer = f.slot[who[i]], by_link[run, measurements.start[t] + i]
                 if k < 0:  # the star was left
                     continue
                 for c in range(3):
@@ -182,37 +178,44 @@ def run_filter(
 
 
 @inside
-def gather_own(
-    own: Floats, measurements: Measurements, assumed: Assumptions, odometry: Floats, white: Floats, run: int, t: int
-) -> None:
-    """The ego's fix and motion at a step."""
-    u, r = measurements.velocity[run, t, measurements.ego], three_of(assumed.fixes, run, t, measurements.ego)
-    q, own[DT] = three_of(assumed.process, run, t, measurements.ego), measurements.dt
+def gather(
+    own: Floats,
+    rows: Floats,
+    who: Ints,
+    measurements: Measurements,
+    assumed: Assumptions,
+    sent: Floats,
+    odometry: Floats,
+    white: Floats,
+    run: int,
+    t: int,
+) -> int:
+    """Fill the ego's row of a step, and its neighbours', with the newest message of each; how many these are."""
+    ego, dt, first = measurements.ego, measurements.dt, measurements.start[t]
+    u, r = measurements.velocity[run, t, ego], three_of(assumed.fixes, run, t, ego)
+    q, own[DT] = three_of(assumed.process, run, t, ego), dt
     for c in range(3):
-        own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, measurements.ego, c], r[c] * white[c]
-        own[MOTION + c], own[MOTION_VARIANCE + c] = measurements.dt * u[c], q[c]
+        own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, ego, c], r[c] * white[c]
+        own[MOTION + c], own[MOTION_VARIANCE + c] = dt * u[c], q[c]
     for i in range(4):
         own[BY_FIXES + i] = odometry[run, t, i]
     measured_motion(own)
-
-
-@inside
-def gather_neighbour(
-    rows: Floats, measurements: Measurements, assumed: Assumptions, sent: Floats, run: int, t: int, link: int, i: int
-) -> None:
-    """The measurement of a neighbour, and the newest message held."""
-    for c in range(5):
-        rows[i, c] = measurements.relative[run, link, c]
-    j, when = measurements.neighbour[link], measurements.newest[run, link]
-    rows[i, AGE] = (t - when) * measurements.dt if when >= 0 else -1.0
-    if when < 0:
-        return
-    u, q = measurements.velocity[run, when, j], three_of(assumed.process, run, when, j)
-    fix = three_of(assumed.fixes, run, when, j)
-    for c in range(9):
-        rows[i, SOLO + c] = sent[j, run, when, c]
-    for c in range(3):
-        rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
+    count = measurements.start[t + 1] - first
+    for i in range(count):
+        link = first + i
+        for c in range(5):
+            rows[i, c] = measurements.relative[run, link, c]
+        who[i], when = measurements.neighbour[link], measurements.newest[run, link]
+        rows[i, AGE] = (t - when) * dt if when >= 0 else -1.0
+        if when < 0:
+            continue
+        u, q = measurements.velocity[run, when, who[i]], three_of(assumed.process, run, when, who[i])
+        fix = three_of(assumed.fixes, run, when, who[i])
+        for c in range(9):
+            rows[i, SOLO + c] = sent[who[i], run, when, c]
+        for c in range(3):
+            rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
+    return count
 
 
 @inner
@@ -412,7 +415,7 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
     if what == BEGIN:
         for c in range(3):
             left[c] = g.x[c]
-        left[3], left[6] = (g.p[0, 0] + g.p[1, 1] + g.p[2, 2]) / 3.0, 0.0
+        left[3], left[6] = ego_variance(f) / 3.0, 0.0
         return False
     if what == BACK:
         clear(g, 0)

@@ -35,7 +35,7 @@ from .cooperative_state import (
     measured_vector,
     measured_whole,
     needs_restart,
-    reset_bias,
+    set_trust,
     start,
 )
 from .gaussian import (
@@ -84,7 +84,7 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
         if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
         if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
-            reset_bias(f, model, j)
+            set_trust(f, j, 0.0, TAU**2 + model.own)
         for kind in range(KINDS):
             remove(f.g, k, kind)
         f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
@@ -100,18 +100,18 @@ def contradicted(f: Filter, k: int) -> bool:
         several += hits >= 3
         if hits >= min(CONTRADICTED, max(2, since - hits)):
             return True
-    return bool(several >= 2)
+    return several >= 2
 
 
 @inside
 def predict(f: Filter, model: Model, own: Floats) -> None:
     """Move the ego; errors that last decay, errors of which nothing is known change."""
-    g, first = f.g, 3 * f.g.block[0, PLACE]
+    g = f.g
     keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
     fades = 1.0 - keep * keep
     drive(f, model, 0, vector_at(own, MOTION // 3), own[DT])
     for c in range(3):
-        g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
+        g.p[c, c] += own[MOTION_VARIANCE + c]
     slip(f, model, own)
     for k in range(len(f.who)):
         if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
@@ -167,11 +167,10 @@ def replace_implausible_velocity(
 def stand(f: Filter, rows: Floats, k: int) -> None:
     """Move a member of whose position nothing is known to where the ego measures it, or, where a component is missing,
     somewhere near: its measurement is linear there."""
-    g, row = f.g, f.who[k, INPUT]
-    ego, first = 3 * g.block[0, PLACE], 3 * g.block[k, PLACE]
+    g, row, first = f.g, f.who[k, INPUT], 3 * f.g.block[k, PLACE]
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):
-        g.x[first + c] = g.x[ego + c] + (measured_vector(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
+        g.x[first + c] = g.x[c] + (measured_vector(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
 
 
 @part

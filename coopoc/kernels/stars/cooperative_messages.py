@@ -47,7 +47,7 @@ from .cooperative_state import (
     WHEN,
     Filter,
     Model,
-    reset_bias,
+    set_trust,
 )
 from .gaussian import (
     ABSENT,
@@ -55,11 +55,11 @@ from .gaussian import (
     COV,
     ERROR,
     GAP,
+    IDENTITY,
     MEASURED,
     PLACE,
     SQUARE,
     TURN,
-    UNIT,
     VARIANCE,
     add_term,
     begin_rows,
@@ -95,9 +95,9 @@ def fix_terms(f: Filter, k: int) -> None:
     """Position of member k, error of its fixes, and the one that all share."""
     block = f.g.block
     begin_rows(f.h)
-    add_term(f.h, block[k, PLACE], UNIT)
-    add_term(f.h, block[k, ERROR], UNIT)
-    add_term(f.h, block[0, COMMON], UNIT)
+    add_term(f.h, block[k, PLACE], IDENTITY)
+    add_term(f.h, block[k, ERROR], IDENTITY)
+    add_term(f.h, block[0, COMMON], IDENTITY)
 
 
 @compiled
@@ -229,7 +229,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
-    return bool(age > ROUNDING)
+    return age > ROUNDING
 
 
 @inner
@@ -255,7 +255,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        reset_bias(f, model, j)
+        set_trust(f, j, 0.0, TAU**2 + model.own)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             f.member[0, LOCKED] = 0.0
             fix_terms(f, 0)
@@ -319,7 +319,7 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
         return False
     tau2 = TAU**2
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
-    return bool(odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE)
+    return odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE
 
 
 @part
@@ -353,7 +353,7 @@ def trust(f: Filter, model: Model) -> None:
         j = f.who[best, VEHICLE]
         f.status[j, TRUSTED], f.status[j, COUNT] = 1.0, 0.0
         begin_rows(h)
-        add_term(h, g.block[best, ERROR], UNIT)
+        add_term(h, g.block[best, ERROR], IDENTITY)
         for c in range(3):
             expect(h, c, 0.0, max(narrow, 1e-6))
             f.status[j, MEAN + c] = 0.0

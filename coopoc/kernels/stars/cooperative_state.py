@@ -131,7 +131,8 @@ them."""
 
 
 class Filter(NamedTuple):
-    """The state of the filter; slot 0 is the ego's, each neighbour has one of the others.
+    """The state of the filter; slot 0 is the ego's, whose position is the first vector; each neighbour has one of the
+    others.
 
     Each array that a function gets takes time to compile: what is of one thing is in one.
 
@@ -242,12 +243,10 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
         0.0,
     )
     f.ego[AGREED] = 0.0
-    f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     clear(g, 0)
-    remove(g, 0, ERROR)
-    insert_error(g, 0, ERROR, (model.own, model.own, model.own))
+    set_trust(f, ego, 1.0, model.own)
     for c in range(3):
-        g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
+        g.x[c] = own[FIX + c]
         f.ego[LEFT + c] += own[MOTION + c]
     if own_votes <= 1 and best >= 0:
         f.member[0, EXTRA_VARIANCE] = 0.0
@@ -273,14 +272,14 @@ def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
     hits = f.who[0, HITS]
     if f.status[ego, TRUSTED] > 0.0:
         young = f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
-        return bool((hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE))
+        return (hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE)
     far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):
         far, noise = far + f.g.x[first + c] ** 2, noise + own[FIX_VARIANCE + c] / 3.0
         between += (f.g.x[first + c] - f.g.x[other + c]) ** 2
     agree = far > FIX_GATE * noise and between < FIX_GATE * noise
-    return bool(others >= 2 or (others == 1 and (far > WILD * noise or agree)))
+    return others >= 2 or (others == 1 and (far > WILD * noise or agree))
 
 
 @part
@@ -293,14 +292,13 @@ def is_placed(own: Floats, rows: Floats, count: int) -> bool:
 
 
 @part
-def reset_bias(f: Filter, model: Model, j: int) -> None:
-    """The fixes of vehicle j have an error of which nothing is known."""
-    f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
+def set_trust(f: Filter, j: int, trusted: float, variance: float) -> None:
+    """Trust the fixes of vehicle j from now on, or not, whose error has that variance, m^2."""
+    f.status[j, TRUSTED], f.status[j, COUNT] = trusted, 0.0
     for c in range(3):
         f.status[j, MEAN + c] = 0.0
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
-        variance = TAU**2 + model.own
         insert_error(f.g, f.slot[j], ERROR, (variance, variance, variance))
 
 
@@ -327,18 +325,18 @@ def mahalanobis2(own: Floats, rows: Floats, i: int, j: int) -> float:
 def seen_from(rows: Floats, row: int, c: int) -> float:
     """Component c m of where the ego is by a neighbour's message; NaN if that has no position."""
     position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - measured_vector(rows, row, c)
-    return float(position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan)
+    return position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan
 
 
 @part
 def measured_vector(rows: Floats, row: int, c: int) -> float:
     """Component c of the measured vector to a neighbour, m."""
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
+    return d * ci if c == 2 else d * si * (ca if c == 0 else sa)
 
 
 @inside
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
     angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)
-    return bool(rows[row, 0] >= 0.0 and angles)
+    return rows[row, 0] >= 0.0 and angles

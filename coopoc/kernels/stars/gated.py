@@ -149,8 +149,7 @@ def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) ->
     q = distance(subtract(position_of(star, k), at), add_diagonal(cov, variance))
     store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
     gain: float = gain_of(cov, variance)
-    signed: float = choose(q - FIX_GATE, gain, -gain)
-    return signed
+    return choose(q - FIX_GATE, gain, -gain)
 
 
 @inner

@@ -35,7 +35,7 @@ compass, rad, with the offset m of its ranges, and the error of their scale; of 
 it."""
 KINDS, TERMS = 7, 6
 ABSENT = -1
-UNIT: Numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+IDENTITY: Numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HARD_REJECT_FACTOR = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
 
@@ -100,7 +100,7 @@ def new_rows(members: int) -> Rows:
 @inside
 def lanes(g: Gaussian) -> int:
     """LANES of numbers that hold the vectors in use."""
-    return int((3 * g.vectors[0] + LANES - 1) // LANES)
+    return (3 * g.vectors[0] + LANES - 1) // LANES
 
 
 @inside
@@ -112,7 +112,7 @@ def three_rows(rows: Floats, i: int, wide: int) -> tuple[float, float, float]:
 @part
 def has(g: Gaussian, member: int, kind: int) -> bool:
     """Whether a vector is in the state."""
-    return bool(g.block[member, kind] >= 0)
+    return g.block[member, kind] >= 0
 
 
 @part
@@ -121,7 +121,7 @@ def insert(g: Gaussian, member: int, kind: int) -> int:
     b = g.vectors[0]
     g.vectors[0] = b + 1
     g.block[member, kind], g.vectors[1 + b] = b, member * KINDS + kind
-    return int(3 * b)
+    return 3 * b
 
 
 @part
@@ -347,8 +347,8 @@ def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> N
             for k in range(3):
                 g.p[new + c, new + d] += b[3 * c + k] * h.three[VARIANCE + k] * b[3 * d + k]
     begin_rows(h)
-    add_term(h, new // 3, UNIT)
-    add_term(h, position, negate(UNIT))
+    add_term(h, new // 3, IDENTITY)
+    add_term(h, position, negate(IDENTITY))
     for c in range(3):
         expect(h, c, 0.0, flat)
     update(g, h)

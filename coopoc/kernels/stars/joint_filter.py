@@ -52,7 +52,6 @@ from .messages import (
     clear,
     fix_information,
     gather,
-    largest,
     moved_of,
     new_estimates,
     position_of,
@@ -208,8 +207,7 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     near = polar[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
     broadcast = choose_each(new, position_of(star, k), somewhere)
-    position: Numbers = choose_each(missing(polar), broadcast, measured)
-    return position
+    return choose_each(missing(polar), broadcast, measured)
 
 
 @inner
@@ -229,8 +227,7 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
 def placed(joint: Joint, k: int, measured: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
-    share: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
-    return share
+    return max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
 
 
 @inner
@@ -310,7 +307,7 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
     """
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
-    most = largest(measurements.start)
+    most = measurements.most
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
         star, before, joint, gates = star_within(most), star_within(most), joint_within(most), gates_within(most)

@@ -27,7 +27,6 @@ from .messages import (
     block_at,
     clear,
     gather,
-    largest,
     new_estimates,
     star_within,
     vector_at,
@@ -39,7 +38,7 @@ def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
-    most = largest(measurements.start)
+    most = measurements.most
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
         star, before, joint = star_within(most), star_within(most), joint_within(most)

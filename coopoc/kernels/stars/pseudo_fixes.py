@@ -52,7 +52,6 @@ from .messages import (
     block_at,
     clear,
     gather,
-    largest,
     moved_of,
     new_estimates,
     position_of,
@@ -116,7 +115,7 @@ def run_intersection(
     """
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
-    most = largest(measurements.start)
+    most = measurements.most
     fusion = Fusion(
         np.zeros((3 * most, LANES)),
         np.zeros((9 * most, LANES)),
@@ -224,15 +223,13 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
 @inside
 def trace(a: Numbers) -> float:
     """Of a 3 x 3 matrix."""
-    diagonal: float = a[0] + a[4] + a[8]
-    return diagonal
+    return a[0] + a[4] + a[8]
 
 
 @inside
 def own_cov(fusion: Fusion) -> Numbers:
     """Covariance m^2 of the ego's prediction."""
-    cov: Numbers = add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
-    return cov
+    return add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
 
 
 @inside
@@ -278,8 +275,7 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    best: float = choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
-    return best
+    return choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
 
 
 @inner
@@ -299,8 +295,7 @@ def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float
 @inside
 def product(a: Numbers, b: Numbers) -> Numbers:
     """A B."""
-    result: Numbers = negate(minus_product(a, b))
-    return result
+    return negate(minus_product(a, b))
 
 
 @inside

@@ -101,7 +101,7 @@ def stream_rows(
         process_variance(motion, newest[STEP:TYPICAL], newest[SPEED:STEP], interval, row[STEP:TYPICAL])
         for c in range(3):
             row[STEP + c], row[TYPICAL + c] = row[STEP + c] * (dt / interval) ** 2, fix[c]
-    return int(outcome)
+    return outcome
 
 
 @compiled

@@ -130,7 +130,7 @@ def pose_measurements(
         np.ascontiguousarray(present(recording)[:, members]),
         np.stack([number[table.observer[links]], number[table.neighbour[links]]], axis=1),
         np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),
-        np.ascontiguousarray(recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark),
+        recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark,
         np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),
         recording.dt,
     )

@@ -70,7 +70,8 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
         """States (H, T, d), their covariances, and costs (H,), from poses (H, 4) whose headings err by that."""
         tried = np.full((len(poses), len(recording.ids), 4), np.nan)
         tried[:, column] = poses
-        own = replace(filter_, spread=(*_spread(noise), turn))
+        spread = [2 * max(std, noise.range_std) for std in noise.fix_std]  # of one fix or one landmark, m
+        own = replace(filter_, spread=(*spread, turn))
         copies = recording.of_runs(np.zeros(len(poses), int))
         x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
         return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, column, poses[:, 3], noise)
@@ -126,12 +127,6 @@ def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
         range_std=float(np.hypot(noise.range_std, fix)),
         azimuth_std=float(np.hypot(noise.azimuth_std, fix / apart)),
     )
-
-
-def _spread(sensors: Sensors) -> tuple[float, float, float]:
-    """Of a position from one fix or one landmark, whichever is worse, m."""
-    x, y, z = (max(std, sensors.range_std) for std in sensors.fix_std)
-    return 2 * x, 2 * y, 2 * z
 
 
 def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: Sensors) -> Floats:
