@@ -23,8 +23,9 @@ from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
 from coopoc.evaluate.scores import scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
+from coopoc.kernels.stars.cooperative_messages import fading_memory
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
-from coopoc.methods.cooperative_filter import Priors, broadcasts, model_of
+from coopoc.methods.cooperative_filter import Priors, model_of
 from coopoc.methods.egos import assumptions, measurements
 from coopoc.methods.noise_model import resolve
 from coopoc.study.results import Results
@@ -109,13 +110,13 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
         velocity[run, step, sender] += 5e-3 * error
     given = replace(damaged(recording, kind, links), velocity=velocity) if kind else recording
     known = resolve("nominal", given)
-    sent = broadcasts(given, known, method.priors)
+    sent = fading_memory(given.gnss, given.velocity, known.fix_variance(given), given.dt)
     if kind in ("position", "odometer"):
-        getattr(sent, kind)[sender, run, step] += error
+        sent[sender, run, step, slice(3) if kind == "position" else slice(6, 9)] += error
     box = inbox(given, EGO, method.message)
     seen, assumed = measurements(given, EGO, box), assumptions(given, known, EGO, box)
-    x, cov = run_filter(seen, assumed, sent, np.empty((0, 0, 4)), model_of(known, method.priors))[:2]
-    return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
+    answer = run_filter(seen, assumed, sent, np.zeros((RUNS, len(given.t), 4)), model_of(known, method.priors))[0]
+    return answer[..., -12:-9], np.sqrt(answer[..., -9::4].sum(axis=-1))
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "position", "odometer", "velocity"])

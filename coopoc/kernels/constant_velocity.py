@@ -67,9 +67,9 @@ def constant_velocity(
             continue
         keep, most = math.exp(-dt / REMEMBERS), -math.inf
         for m in range(models):
-            q, before = (bank[m] / interval) ** 4, p[m, 0]
-            a = p[m, 0] + 2.0 * dt * p[m, 1] + dt * dt * p[m, 2] + q * dt**3 / 3.0
-            b, d = p[m, 1] + dt * p[m, 2] + q * dt * dt / 2.0, p[m, 2] + q * dt
+            q, (before, b, d) = (bank[m] / interval) ** 4, p[m]
+            a = before + 2.0 * dt * b + dt * dt * d + q * dt**3 / 3.0
+            b, d = b + dt * d + q * dt * dt / 2.0, d + q * dt
             s, square = a + 1.0, 0.0
             for c in range(3):
                 x[m, c] += dt * u[m, c]

@@ -7,8 +7,11 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
+from .compiling.small import subtract
 from .gate import FIX_GATE, HARD_REJECT_FACTOR
 from .geometry import direction, five, residuals, with_std
+from .stars.gaussian import distance
+from .stars.messages import BLOCK, block_at, vector_at
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
@@ -43,22 +46,14 @@ def less(a: Floats, b: Floats) -> tuple[float, float, float]:
 def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
     """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero or the truth is unknown, and whether every other
     P could be inverted, but for a height without error."""
-    squares, sound = np.empty(x.shape[:3]), True
-    for run in range(len(x)):
-        for t in range(x.shape[1]):
-            for e in range(x.shape[2]):
-                p = cov[run, t, e]
-                a, b, c = less(x[run, t, e], truth[t, e])
-                first, second = p[0, 1] / p[0, 0], p[0, 2] / p[0, 0]
-                yy, yz, zz = p[1, 1] - first * p[0, 1], p[1, 2] - first * p[0, 2], p[2, 2] - second * p[0, 2]
-                third, b = yz / yy, b - first * a
-                zz, c = zz - third * yz, c - second * a - third * b
-                value = a * a / p[0, 0] + b * b / yy + (c * c / zz if c != 0.0 else 0.0)
-                if not math.isfinite(value):
-                    sound &= math.isnan(a) or not p.any()
-                    value = np.nan
-                squares[run, t, e] = value
-    return squares, sound
+    squares, sound = np.empty(x.shape[0] * x.shape[1] * x.shape[2]), True
+    for i in range(len(squares)):
+        p, error = block_at(cov, i), subtract(vector_at(x, i), vector_at(truth, i % (truth.size // 3)))
+        squares[i] = distance(p, error)[0]
+        if not math.isfinite(squares[i]):
+            sound &= math.isnan(error[0]) or p == BLOCK
+            squares[i] = np.nan
+    return squares.reshape(x.shape[:3]), sound
 
 
 @compiled
@@ -70,7 +65,7 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
         x: (R, T, E, 3) m.
         cov: (R, T, E, 3, 3) m^2, or of no length.
         columns: (E,) of the vehicles.
-        fix: (2, 3) m^2, variances of a fix, what is white and what lasts.
+        fix: (E, 2, 3) m^2, variances of a fix, what is white and what lasts.
         every: steps from one fix to the next, at least.
         marks: (3, E, T) out, 1 where fixes are far, or else contradict covariances.
     """
@@ -88,12 +83,12 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
                 for c in range(3):
                     gap = gnss[run, now, columns[k], c] - x[run, now, k, c]
                     own = cov[run, now, k, c, c] if len(cov) > 0 else 0.0
-                    r[c], p[c], q = r[c] + gap, p[c] + own, q + gap * gap / (fix[0, c] + fix[1, c] + own)
+                    r[c], p[c], q = r[c] + gap, p[c] + own, q + gap * gap / (fix[k, 0, c] + fix[k, 1, c] + own)
                 count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / TOGETHER
                 if count < TOGETHER:
                     continue
                 for c in range(3):
-                    square += r[c] * r[c] / (TOGETHER * (p[c] + fix[0, c] + TOGETHER * fix[1, c]))
+                    square += r[c] * r[c] / (TOGETHER * (p[c] + fix[k, 0, c] + TOGETHER * fix[k, 1, c]))
                     r[c] = p[c] = 0.0
                 worst[run, k] = max(worst[run, k], mean, square)
                 kind = int(far < TOGETHER)
@@ -144,7 +139,7 @@ def mark_odometers(
                     continue
                 walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
                 for c in range(3):
-                    slip += (e[c] - last[c]) ** 2 / (2.0 * (fix[0, c] / TOGETHER + fix[1, c]) + walk)
+                    slip += (e[c] - last[c]) ** 2 / (2.0 * (fix[k, 0, c] / TOGETHER + fix[k, 1, c]) + walk)
                     last[c], e[c] = e[c], 0.0
                 for i in range(max(begin, 0), t + 1 if begin >= 0 and slip > DOUBT else 0):
                     marks[2, k, i] = 1
@@ -173,7 +168,7 @@ def mark_neighbours(
         cov: (R, T, 3, 3) m^2.
         neighbours: (R, M, 3) m, estimates by link of the ego.
         links: (M, 3) in time order: index among all L, step and neighbour of each.
-        fix: (2, 3) m^2, as of `mark_estimates`.
+        fix: (2, 3) m^2, variances of a fix, what is white and what lasts.
         std: (3,) m, rad, rad.
         every: steps from one to the next, at least.
         marks: (2, N, T) out, 1 where they are far: messages, relative measurements.

@@ -16,7 +16,7 @@ cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 import math
 
 from .compiling.compile import inside
-from .compiling.small import add, add_diagonal, apply, from_upper, inverse, scale, subtract, times
+from .compiling.small import add, add_diagonal, apply, from_upper, inner_product, inverse, scale, subtract
 from .compiling.vectors import choose
 
 GATE, FIX_GATE = 9.0, 12.0
@@ -55,15 +55,13 @@ def inflation(q: float, gate: float, hits: float) -> float:
     So the influence of an innovation falls as 1 / sqrt(q), and ends.
     """
     share = choose(q - HARD_REJECT_FACTOR * gate, math.inf, max(q / gate, 1.0))
-    counts: float = choose(PATIENCE - hits, share, 1.0)
-    return counts
+    return choose(PATIENCE - hits, share, 1.0)
 
 
 @inside
 def count(q: float, gate: float, hits: float, gain: float) -> float:
     """Next value of the lock-out counter: the gains of measurements beyond the gate, less LEAK of those within."""
-    more: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
-    return more
+    return choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
 
 
 @inside
@@ -94,22 +92,16 @@ def remember(
 
 
 @inside
-def total(a: Vector) -> float:
-    """Sum of three."""
-    return a[0] + a[1] + a[2]
-
-
-@inside
 def gain_of(cov: Vector, variance: Vector) -> float:
     """Gain of a position, the mean over the axes: tr P / (tr P + tr R)."""
     own = cov[0] + cov[4] + cov[8]
-    return own / (own + total(variance))
+    return own / (own + (variance[0] + variance[1] + variance[2]))
 
 
 @inside
 def distance(innovation: Vector, cov: Vector) -> float:
     """Squared normalised innovation of a position."""
-    return total(times(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation)))
+    return inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation))
 
 
 @inside
@@ -129,7 +121,7 @@ def gated_update(
         Covariance, shift, the factor of the noise's variance by which S is inflated, and hits.
     """
     g = apply(cov, h)
-    s, left = total(times(h, g)) + variance, innovation - total(times(h, moved))
+    s, left = inner_product(h, g) + variance, innovation - inner_product(h, moved)
     q = left * left / s
     f = inflation(q, GATE, hits)
     factor = choose(q - GATE, 1.0 + (f - 1.0) * s / variance, 1.0)

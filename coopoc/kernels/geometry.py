@@ -97,8 +97,7 @@ def series(sine: float, cosine: float) -> float:
     s = t * t
     tail = less(1 / 17, s, less(1 / 19, s, less(1 / 21, s, less(1 / 23, s, 1 / 25))))
     tail = less(1 / 9, s, less(1 / 11, s, less(1 / 13, s, less(1 / 15, s, tail))))
-    small: float = t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
-    return small
+    return t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
 
 
 @inner
@@ -146,8 +145,7 @@ def spread(polar: Numbers, a: float, b: float, c: float) -> Numbers:
     _, sa, ca, si, ci = polar
     flat, cross = plus(a * si * si, c * ci, ci), (a - c) * si * ci
     xx, yy, zz = plus(flat * ca * ca, b * sa, sa), plus(flat * sa * sa, b * ca, ca), plus(a * ci * ci, c * si, si)
-    whole: Numbers = from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
-    return whole
+    return from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
 
 
 @inside
@@ -160,19 +158,13 @@ def metres(polar: Numbers, std: Numbers | Floats, least: float) -> Numbers:
     return std[0], std[1] * level * reach, std[2] * reach
 
 
-@inside
-def information(polar: Numbers, std: Numbers, unit: bool, least: float) -> Numbers:
-    """C^-1 of a vector converted from range and angles, at the geometry `polar`; `unit`: 1 m along each axis."""
-    a, b, c = std if unit else metres(polar, std, least)
-    return spread(polar, 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c))
-
-
 @inner
 def converted(gap: Numbers, measured: Numbers, unit: bool, least: float) -> tuple[Numbers, Numbers]:
-    """C^-1 and C^-1 (measured vector - gap), weighted by the geometry of the vector `gap`; components that are missing
-    are those of `gap`."""
+    """C^-1 and C^-1 (measured vector - gap), weighted by the geometry of the vector `gap`, or by 1 m along each axis if
+    `unit`; components that are missing are those of `gap`."""
     polar = direction(gap[0], gap[1], gap[2])
-    weight = information(polar, measured[5:], unit, least)
+    a, b, c = measured[5:] if unit else metres(polar, measured[5:], least)
+    weight = spread(polar, 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c))
     return weight, apply(weight, subtract(vector(completed(measured, polar)), gap))
 
 
@@ -201,8 +193,7 @@ def exact(gap: Numbers, measured: Numbers, least: float) -> tuple[Numbers, Numbe
 @inside
 def missing(measured: Numbers) -> float:
     """Positive where a component is missing, else negative."""
-    lacks: float = measured[5] + measured[6] + measured[7] - (0.0 * measured[0] + 1e300)
-    return lacks
+    return measured[5] + measured[6] + measured[7] - (0.0 * measured[0] + 1e300)
 
 
 @inside
@@ -215,8 +206,7 @@ def incomplete(measured: Numbers) -> bool:
 def whole(measured: Numbers) -> float:
     """1 where all components were measured, else 0."""
     o = 0.0 * measured[0]
-    share: float = choose(missing(measured), o, o + 1.0)
-    return share
+    return choose(missing(measured), o, o + 1.0)
 
 
 @inner

@@ -81,10 +81,8 @@ def correct(state: Floats, velocity: Floats, dt: float) -> float:
         return 0.0
     velocity[0] += state[ERROR]
     velocity[1] += state[ERROR + 1]
-    more: float = (
-        2.0 * dt * state[VARIANCE + 1] + dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2] + JERKY * dt**3 / 3.0
-    )
-    return more
+    grown = dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2]
+    return 2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0
 
 
 @part
@@ -116,7 +114,7 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     gather_evidence(state, r / state[COUNT], dt)
     if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < LONG:
         return 0.0
-    gap2: float = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
+    gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
     least = max(SHARE * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
     if min(gap2, size2) < least * least:
@@ -196,14 +194,13 @@ def correct_drives(
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle, which begins anew.
         fresh: of `new_state`.
-        variance: (3,) m^2 of a fix.
+        variance: (N, 3) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
-        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
-            length only to ask.
+        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2.
     """
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)
-    r, fails = 0.5 * (variance[0] + variance[1]), False
+    fails = False
     for run in range(gnss.shape[0]):
         for e in range(len(columns)):
             for i in range(SIZE):
@@ -217,9 +214,9 @@ def correct_drives(
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)
+                r = 0.5 * (variance[n, 0] + variance[n, 1])
                 extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
-                if len(out):
-                    out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
-                    out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
+                out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
+                out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
     return fails

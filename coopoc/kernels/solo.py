@@ -43,6 +43,7 @@ class SoloMeasurements(NamedTuple):
         gnss: (R, T, N, 3) m, NaN for no fix and for an absent vehicle.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle.
         process: (R, T, E, 3) m^2, variance of a step's motion.
+        fixes: (E, 3) m^2, variance of a fix.
         columns: (E,) of the vehicles.
         dt: s.
     """
@@ -50,6 +51,7 @@ class SoloMeasurements(NamedTuple):
     gnss: Floats
     velocity: Floats
     process: Floats
+    fixes: Floats
     columns: Ints
     dt: float
 
@@ -108,31 +110,29 @@ def step(state: AxisState, moved: float, process: float, fix: float, noise: floa
 
 
 @compiled
-def run_filter(
-    measurements: SoloMeasurements, rule: FixNoise, exact: bool, index: Ints, x: Floats, p: Floats
-) -> Floats:
+def run_filter(measurements: SoloMeasurements, gate: float, exact: bool, index: Ints, x: Floats, p: Floats) -> Floats:
     """Fill x m and p m^2 of the vehicles, and return the variance of each fix, where it is gated.
 
     A vehicle that was absent starts at its first fix.
 
     Args:
         measurements: the vehicles and their measurements.
-        rule: noise of the fixes.
+        gate: of the fixes, as of FixNoise.
         exact: whether x[:, 0] is given and exact; if not, it is a fix.
         index: (E,) of the vehicles in x and p.
         x: (R, T, E or N, 3).
         p: the same.
     """
-    noise = np.empty(x.shape if rule.gate > 0.0 else (0, 0, 0, 3))
+    noise = np.empty(x.shape if gate > 0.0 else (0, 0, 0, 3))
     states = np.empty((len(measurements.columns), 3, len(STATE)))
-    filter_runs(measurements, rule, exact, index, states, x, p, noise)
+    filter_runs(measurements, gate, exact, index, states, x, p, noise)
     return noise
 
 
 @part
 def filter_runs(
     measurements: SoloMeasurements,
-    rule: FixNoise,
+    gate: float,
     exact: bool,
     index: Ints,
     states: Floats,
@@ -141,15 +141,14 @@ def filter_runs(
     noise: Floats,
 ) -> None:
     """`run_filter` in given memory."""
-    r = three(rule.variance)
     for run in range(measurements.gnss.shape[0]):
         for t in range(measurements.gnss.shape[1]):
             for e in range(len(measurements.columns)):
                 n, at = measurements.columns[e], index[e]
                 u, q = measurements.velocity[run, t, n], three(measurements.process[run, t, e])
-                fix = three(measurements.gnss[run, t, n])
+                fix, r = three(measurements.gnss[run, t, n]), three(measurements.fixes[e])
                 moved = measurements.dt * u[0], measurements.dt * u[1], measurements.dt * u[2]
-                gated = gate_fix(states[e], moved, q, fix, r, rule.gate if t > 0 else 0.0)
+                gated = gate_fix(states[e], moved, q, fix, r, gate if t > 0 else 0.0)
                 for c in range(3):
                     if t == 0 and exact:
                         state = start_state(x[run, 0, at, c], 0.0)

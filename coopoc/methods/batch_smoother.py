@@ -180,8 +180,6 @@ def located(recording: Recording) -> Bools:
     A vehicle that has no fix yet has no position to linearise at: until then it takes no part.
     """
     present = np.isfinite(recording.velocity[0, :, :, 0])
-    if recording.complete:
-        return np.tile(present, (recording.runs, 1, 1))
     step = np.arange(len(present))[:, None]
     before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
     joined = np.maximum.accumulate(np.where(present & ~before, step, -1))

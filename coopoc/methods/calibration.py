@@ -34,13 +34,13 @@ class Part(NamedTuple):
         recording: of it.
         column: of the vehicle.
         target: (R or 1, T, 3) m, its true positions or fixes that the recording does not hold; NaN for none.
-        variance: m^2, of fixes that stand for the truth, or 0.
+        variance: (2,) m^2, of fixes that stand for the truth, or 0.
     """
 
     recording: Recording
     column: int
     target: Floats
-    variance: Floats | float
+    variance: Floats
 
 
 def calibrated(
@@ -154,7 +154,7 @@ def held_out(method: Method, usual: Method, parts: Sequence[Part], since: float)
     return float(change.mean()), float(half)
 
 
-def cost(x: Floats, cov: Floats, true: Floats, variance: Floats | float = 0.0) -> Floats:
+def cost(x: Floats, cov: Floats, true: Floats, variance: Floats) -> Floats:
     """(R,) what calibration reduces: logarithm of RT-LE in the plane, and LIKELIHOOD times minus the mean log
     likelihood of the true positions, as Student's t with four degrees of freedom: a lost filter costs a logarithm.
 
@@ -162,13 +162,12 @@ def cost(x: Floats, cov: Floats, true: Floats, variance: Floats | float = 0.0) -
         x: (R, T, 3) m.
         cov: (R, T, 3, 3) m^2.
         true: (R or 1, T, 3) m, NaN where unknown.
-        variance: (2,) m^2, of fixes that stand for the truth; then the likelihood alone counts.
+        variance: (2,) m^2, of fixes that stand for the truth: then the likelihood alone counts; else 0.
     """
     error = (x - true)[..., :2]
     there = np.isfinite(error[..., 0])
     error, count = np.where(there[..., None], error, 0.0), np.maximum(there.sum(axis=-1), 1)
-    east, north = np.broadcast_to(variance, 2)
-    a, b, c = cov[..., 0, 0] + east, cov[..., 1, 1] + north, cov[..., 0, 1]
+    a, b, c = cov[..., 0, 0] + variance[0], cov[..., 1, 1] + variance[1], cov[..., 0, 1]
     det = np.maximum(a * b - c * c, 1e-12)
     e, n = error[..., 0], error[..., 1]
     nees = (b * e * e - 2.0 * c * e * n + a * n * n) / det

@@ -11,7 +11,7 @@ from ..arrays import Floats, check_fields, number
 from ..kernels.gate import GATE
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
-from ..kernels.stars.cooperative_state import Model, Sent
+from ..kernels.stars.cooperative_state import Model
 from ..kernels.stars.messages import FORGOTTEN
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
@@ -216,18 +216,21 @@ class CooperativeFilter(Checked):
             recording, noise_model = with_odometry(recording, columns, noise_model, priors.fix)
         extra, noise_model = noise_model.extra, replace(noise_model, extra=None)
         model, notes = model_of(noise_model, priors), [*noise_model.notes, *filter(None, [self.calibration])]
-        variance, sent = priors.fix**2 * noise_model.fix_variance(recording), broadcasts(recording, noise_model, priors)
+        variance = priors.fix**2 * noise_model.fix_variance(recording)
+        sent = fading_memory(recording.gnss, recording.velocity, variance, recording.dt)
         stated = noise_model.compass[1], noise_model.sensors.range_offset_std if noise_model.sensors else 0.0
 
         def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
             inputs, assumed = measurements(recording, ego, inbox), assumptions(recording, noise_model, ego, inbox)
             assumed = assumed._replace(fixes=variance)
-            odometry = np.empty((0, 0, 4))
+            odometry = np.zeros((*velocity.shape[:2], 4))
             if extra is not None:
-                by_fixes = recording.dt * (recording.velocity - velocity)[:, :, ego]
-                odometry = np.concatenate([by_fixes, extra[:, :, ego, None]], axis=-1)
-            x, cov, neighbours, fixes, weights, deviations = run_filter(inputs, assumed, sent, odometry, model)
-            extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate((*KINDS, "clock"))}
+                odometry[..., :3] = recording.dt * (recording.velocity - velocity)[:, :, ego]
+                odometry[..., 3] = extra[:, :, ego]
+            of_ego, by_link = run_filter(inputs, assumed, sent, odometry, model)
+            fixes, deviations, x, cov = np.split(of_ego, [1, -12, -9], axis=-1)
+            neighbours, weights = by_link[..., :3], by_link[..., 3:]
+            extras = {"fix": fixes} | {kind: weights[..., k] for k, kind in enumerate((*KINDS, "clock"))}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
@@ -248,7 +251,7 @@ class CooperativeFilter(Checked):
                 for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
                     what = f"{kind}, {own_id} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
-            yield Estimate(x, cov, neighbours, extras=extras)
+            yield Estimate(x, cov.reshape(*x.shape, 3), neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
 
@@ -280,12 +283,6 @@ class CooperativeFilter(Checked):
 
         method, sentence = calibrated(make, usual, recording, truth)
         return replace(method, calibration=sentence)
-
-
-def broadcasts(recording: Recording, noise_model: NoiseModel, priors: Priors) -> Sent:
-    """Messages of all vehicles."""
-    variance = priors.fix**2 * noise_model.fix_variance(recording)
-    return Sent(*fading_memory(recording.gnss, recording.velocity, variance, recording.dt))
 
 
 def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:

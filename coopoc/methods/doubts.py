@@ -66,16 +66,12 @@ def doubts(
     every, marks = max(min(round(SECOND / recording.dt), steps // TOGETHER), 1), np.zeros((3, len(egos), steps), int)
     turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
     motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
-    scale, usual = recording.fix_scale[egos, 0], DOUBT * (neighbours is not None)
-    for factor in np.unique(scale):
-        of = slice(None) if (scale == factor).all() else np.flatnonzero(scale == factor)
-        own = fix * [[factor**2], [1.0]]
-        part, its = marks[:, of], claimed[:, :, of] if claimed.size else claimed
-        doubtful = mark_estimates(recording.gnss, x[:, :, of], its, egos[of], own, every, part) + usual
-        if recording.body is None:
-            drive = recording.gnss, recording.velocity, egos[of], doubtful
-            mark_odometers(*drive, own, motion, every, recording.dt, part)
-        marks[:, of] = part
+    fixes = np.stack([recording.fix_scale[egos] ** 2 * fix[0], np.tile(fix[1], (len(egos), 1))], axis=1)
+    doubtful = mark_estimates(recording.gnss, x, claimed, egos, fixes, every, marks)
+    doubtful += DOUBT * (neighbours is not None)
+    if recording.body is None:
+        drive = recording.gnss, recording.velocity, egos, doubtful
+        mark_odometers(*drive, fixes, motion, every, recording.dt, marks)
 
     def add(text: str, marked: Ints, *names: int) -> None:
         if marked.any():

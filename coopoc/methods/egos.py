@@ -87,20 +87,17 @@ def measurements(recording: Recording, ego: int, inbox: Inbox, broadcast: Floats
         inbox: its messages.
         broadcast: (R, T, N, 3) m, position in a message; None for the fix.
     """
-    neighbour, start, newest = (
-        np.ascontiguousarray(numbers, dtype=np.int64)
-        for numbers in (recording.links.neighbour[inbox.link], inbox.start, inbox.newest)
-    )
     gnss = recording.gnss
     return Measurements(
         gnss,
         recording.velocity,
         gnss if broadcast is None else broadcast,
         components(recording.usable_relative, inbox.link),
-        neighbour,
-        start,
-        newest,
-        np.ascontiguousarray(inbox.fresh),
+        recording.links.neighbour[inbox.link],
+        inbox.start,
+        inbox.newest,
+        inbox.fresh,
+        1 + int(np.diff(inbox.start).max(initial=0)),
         int(ego),
         recording.dt,
     )

@@ -11,6 +11,9 @@ from ..errors import InputError
 from ..world.recording import Recording, Vehicles, check_recording
 from .track import Method, Track
 
+ESTIMATES = "x", "covariance", "neighbours", "heading", "heading_covariance"
+"""Arrays of a Track; None of what a method does not estimate."""
+
 
 def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
     """A method's `__call__` that begins anew after each gap of an ego; its estimate is NaN where there is none.
@@ -75,42 +78,38 @@ def _from(method: Any, start: int) -> Any:
 
 def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tuple[int, int]], Track]) -> Track:
     """Tracks of one ego each, in stretches of the recording, as one of all."""
-    shape = recording.runs, len(recording.t), len(columns)
-    some, links = [*parts.values()], recording.links
+    (runs, steps), links = recording.gnss.shape[:2], recording.links
     own_links = [links.of(column) for column in columns]
     ends = np.cumsum([0, *map(len, own_links)])
-    absent, notes = np.ones(shape[1:], bool), dict[str, None]()
-    made: dict[str, Any] = {"neighbours": None if some[0].neighbours is None else (shape[0], ends[-1], 3)}
-    for name in ("x", "covariance", "heading", "heading_covariance"):
-        first = getattr(some[0], name)
-        made[name] = None if first is None else (*shape, *first.shape[3:])
-    made = {name: size and np.full(size, np.nan) for name, size in made.items()}
-    extras = {
-        name: np.full(shape if v.ndim == 3 else (shape[0], ends[-1]), np.nan) for name, v in some[0].extras.items()
-    }
-    received, sent = np.zeros((2, shape[0], len(columns)))
+    absent, notes, whole = np.ones((steps, len(columns)), bool), dict[str, None](), dict[str, Any]()
+    received, sent = np.zeros((2, runs, len(columns)))
     for (column, (start, stop)), track in parts.items():
         e = columns.index(column)
         absent[start:stop, e] = False if track.absent is None else track.absent[:, 0]
         received[:, e] += track.received_bytes[:, 0]
         sent[:, e] += track.sent_bytes[:, 0]
         here = ends[e] + np.flatnonzero((links.step[own_links[e]] >= start) & (links.step[own_links[e]] < stop))
-        for name, values in (*((k, getattr(track, k)) for k in made), *track.extras.items()):
-            of = made.get(name, extras.get(name))
-            if of is not None and of.shape[1] == shape[1] and name != "neighbours" and values.ndim > 2:
-                of[:, start:stop, e] = values[:, :, 0]
-            elif of is not None:
-                of[:, here] = values
+        for name, values in (*((name, getattr(track, name)) for name in ESTIMATES), *track.extras.items()):
+            if values is None:
+                continue
+            by_link = name == "neighbours" or values.ndim == 2
+            if name not in whole:
+                size = (runs, ends[-1]) if by_link else (runs, steps, len(columns))
+                whole[name] = np.full((*size, *values.shape[len(size) :]), np.nan)
+            if by_link:
+                whole[name][:, here] = values
+            else:
+                whole[name][:, start:stop, e] = values[:, :, 0]
         notes |= dict.fromkeys(track.notes)
-    seconds = sum(track.seconds for track in some)
+    made = {name: whole.pop(name, None) for name in ESTIMATES}
     return Track(
         recording.t,
         tuple(columns),
         received_bytes=received,
         sent_bytes=sent,
-        seconds=seconds,
+        seconds=sum(track.seconds for track in parts.values()),
         notes=tuple(notes),
-        extras=extras,
+        extras=whole,
         ids=recording.ids,
         absent=absent,
         **made,

@@ -1,7 +1,7 @@
 """Solo methods: the raw fix, and the Kalman filter on position."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -170,28 +170,17 @@ def solo_filter(
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     columns = np.asarray(columns)
     shape = *gnss.shape[:2], len(columns), 3
-    first = int(x0 is not None)
+    first, scale = int(x0 is not None), np.ones((1, 1))
     if isinstance(noise, MotionNoise):
         process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
     else:
-        process = noise.process_variance(recording, columns, first=first)
-    inputs = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), columns, recording.dt)
+        process, scale = noise.process_variance(recording, columns, first=first), noise.fix_scale(recording)
+    variance = np.broadcast_to(scale**2 * fixes.variance, gnss.shape[2:])[columns]
+    inputs = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), variance, columns, recording.dt)
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
     x, p = np.empty(size), np.empty(size)
-    scale = np.ones(1) if isinstance(noise, MotionNoise) else noise.fix_scale(recording)[:, 0]
-    if (scale != 1.0).any():
-        plain, gated, start = replace(recording, fix_factor=()), np.empty(size), None if x0 is None else np.asarray(x0)
-        for factor in np.unique(scale[columns]):
-            own = np.flatnonzero(scale[columns] == factor)
-            part = fixes._replace(variance=factor**2 * fixes.variance)
-            found = solo_filter(plain, columns[own], noise, part, None if start is None else start[..., own, :])
-            x[:, :, index[own]], p[:, :, index[own]] = found[:2]
-            gated = gated[:, :, :0] if not found[2].size else gated
-            if found[2].size:
-                gated[:, :, index[own]] = found[2]
-        return x, p, gated
     if x0 is not None:
         x[:, 0] = x0
-    return x, p, run_filter(inputs, fixes, x0 is not None, index, x, p)
+    return x, p, run_filter(inputs, fixes.gate, x0 is not None, index, x, p)

@@ -1,14 +1,12 @@
 """Inputs of streams: checks of a step, and the newest motions of a vehicle, which bring a late fix forward."""
 
 import sys
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, number, plain
-from ..errors import InputError, shown
+from ..errors import InputError
 from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
 from ..world.plausible import FARTHEST
 
@@ -98,26 +96,6 @@ def three(field: str, value: npt.ArrayLike, limit: float = FARTHEST) -> Floats:
     if array.shape != (3,) or not (np.abs(array) <= limit).all():
         raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
     return array
-
-
-def names_of(field: str, name_list: Any, kind: type[Any]) -> list[str]:
-    """Names of the vehicles that a stream is given measurements of, each once.
-
-    Args:
-        field: name of the argument.
-        name_list: a sequence of measurements.
-        kind: their class.
-
-    Raises:
-        InputError: anything else, or a vehicle twice.
-    """
-    names = [each.id for each in name_list if isinstance(each, kind)] if isinstance(name_list, Sequence) else None
-    if names is None or len(names) < len(name_list):
-        hint = f"Give a list of {kind.__name__}, empty for none."
-        raise InputError(field, shown(name_list), f"must hold {kind.__name__}s", hint)
-    if len(set(names)) < len(names):
-        raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
-    return names
 
 
 def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:

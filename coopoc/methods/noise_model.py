@@ -66,7 +66,7 @@ class NoiseModel:
                 value = checked(field, getattr(self, field), "(3,)", (3,))
                 if not (np.isfinite(value) & (value > 0)).all():
                     raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
-                self.__dict__[field] = _three(value)
+                self.__dict__[field] = tuple(value.tolist())
 
     @classmethod
     def identity(cls) -> "NoiseModel":
@@ -106,7 +106,7 @@ class NoiseModel:
         process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)
         gnss = np.sqrt(np.nanmean((recording.gnss - fleet.position) ** 2, axis=(0, 1, 2)))
         gnss = np.where(gnss > 0, gnss, recording.sensors.gnss_std)
-        return cls("fitted", recording.sensors, _three(process), _three(gnss))
+        return cls("fitted", recording.sensors, tuple(process.tolist()), tuple(gnss.tolist()))
 
     def process_variance(
         self,
@@ -161,7 +161,7 @@ class NoiseModel:
 
     def fix_scale(self, recording: Recording) -> Floats:
         """(N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
-        return recording.fix_scale if recording.fix_factor and self.sensors is not None else np.ones((1, 1))
+        return np.ones((1, 1)) if self.sensors is None else recording.fix_scale
 
     @property
     def gnss_variance(self) -> Floats:
@@ -312,7 +312,3 @@ def check_interval(interval: float) -> float:
     hint = "The dt that the noise belongs to."
     checked: float = number("interval", interval, sys.float_info.min, allowed="finite and > 0", hint=hint)
     return checked
-
-
-def _three(values: Floats) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])

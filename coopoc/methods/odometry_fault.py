@@ -29,17 +29,10 @@ def with_odometry(
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
-    fresh, scale = new_state(motion_noise(noise_model, recording.dt)), np.ones((len(recording.ids), 1))
-    scale, variance = (scale * noise_model.fix_scale(recording))[:, 0], fix**2 * noise_model.gnss_variance
-    given = [
-        (gnss, velocity, fresh, factor**2 * variance, columns[scale[columns] == factor], recording.dt)
-        for factor in np.unique(scale[columns])
-    ]
-    if not any(correct_drives(*each, np.empty((0, 0, 0, 3))) for each in given):
+    fresh, found = new_state(motion_noise(noise_model, recording.dt)), np.zeros(velocity.shape)
+    variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)
+    if not correct_drives(gnss, velocity, fresh, variance, columns, recording.dt, found):
         return recording, noise_model
-    found = np.zeros(velocity.shape)
-    for each in given:
-        correct_drives(*each, found)
     velocity, extra = velocity.copy(), found[..., 2]
     velocity[..., :2] += found[..., :2]
     notes = [*noise_model.notes]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, Ints, instance, refuse
-from ..errors import InputError
+from ..errors import InputError, shown
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.geometry import components
 from ..kernels.motion import MotionNoise
@@ -34,7 +34,7 @@ from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_st
 from ..world.links import drop_steep_azimuths
 from ..world.plausible import FARTHEST, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
-from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .motion_history import MotionHistory, fix_or_none, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
 
 FIRST = np.zeros(1, np.int64)
@@ -91,6 +91,17 @@ class RelativeMeasurement:
             allowed = f"of {self.id} must hold position, velocity, variance and odometer"
             raise InputError("message", "a part of one", allowed, "Send stream.broadcast.")
         self.__dict__["row"] = row.tobytes()
+
+
+def _names(neighbours: Any) -> list[str]:
+    """Names of the neighbours of a step; InputError for anything but measurements of them, or for one twice."""
+    if not isinstance(neighbours, Sequence) or not all(isinstance(each, RelativeMeasurement) for each in neighbours):
+        hint = "Give a list of RelativeMeasurement, empty for none."
+        raise InputError("neighbours", shown(neighbours), "must hold RelativeMeasurements", hint)
+    names = [each.id for each in neighbours]
+    if len(set(names)) < len(names):
+        raise InputError("neighbours", names, "must be given once each", "Merge the measurements of one vehicle.")
+    return names
 
 
 class StarStream:
@@ -191,15 +202,23 @@ class StarStream:
         Raises:
             InputError: as `FilterStream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
-        names = names_of("neighbours", neighbours, RelativeMeasurement)
+        names = _names(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
-        columns, time, motion, fix = self._columns(names), self._time + float(dt), self._motion, self._fix
+        columns, own, time = self._columns(names), np.empty(OWN), self._time + float(dt)
         rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
-        own, history, last = np.empty(OWN), self.history.reserve(), self._last
-        own_memory, oldest = self._memory, self.max_age
-        state = self._odometry
         outcome = stream_rows(
-            self._given, history, motion, fix, state, own, rows, columns, last, time, oldest, own_memory
+            self._given,
+            self.history.reserve(),
+            self._motion,
+            self._fix,
+            self._odometry,
+            own,
+            rows,
+            columns,
+            self._last,
+            time,
+            self.max_age,
+            self._memory,
         )
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
@@ -213,13 +232,10 @@ class StarStream:
 
     def _columns(self, names: list[str]) -> Ints:
         """Numbers of the vehicles, 1 and up; the filter has room for them."""
-        try:
-            columns = np.fromiter(map(self._numbers.__getitem__, names), np.int64, len(names))
-        except KeyError:
-            self._meet([name for name in names if name not in self._numbers], names)
-            return self._columns(names)
+        if new := [name for name in names if name not in self._numbers]:
+            self._meet(new, names)
         self._reserve(1 + len(names), len(self._last))
-        return columns
+        return np.array([self._numbers[name] for name in names], np.int64)
 
     def _meet(self, new: list[str], names: list[str]) -> None:
         """Number new vehicles; forget those that are in no star that is remembered, and whose messages are too old."""
@@ -242,16 +258,7 @@ class StarStream:
 
     def _reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""
-        before = self._filter
+        before, tries = self._filter, self._tries
         if slots > len(before.who) or vehicles > len(before.slot):
-            self._copy(max(len(before.who), 2 * slots), vehicles)
-
-    def _copy(self, slots: int, vehicles: int) -> None:
-        before = self._filter, self._tries
-        self._filter, self._tries = make_filter(slots, vehicles)
-        restore(*before, self._filter, self._tries)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Arrays that share memory have come apart in the pickle."""
-        self.__dict__.update(state)
-        self._copy(len(self._filter.who), len(self._filter.slot))
+            self._filter, self._tries = make_filter(max(len(before.who), 2 * slots), vehicles)
+            restore(before, tries, self._filter, self._tries)

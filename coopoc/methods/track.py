@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -108,8 +108,9 @@ class Track:
         if self.absent is not None:
             self.__dict__["absent"] = checked("absent", self.absent, "(T, E)", x.shape[1:3], bool)
         there = np.ones(x.shape[1:3], bool) if self.absent is None else ~self.absent
-        if not np.isfinite(self.x).all(axis=-1).all(where=there):
-            run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1) & there)[0]
+        lost = there & ~np.isfinite(self.x).all(axis=-1)
+        if lost.any():
+            run, step, ego = np.argwhere(lost)[0]
             raise InputError(
                 "x",
                 f"not finite in run {run} at step {step} of ego {self.egos[ego]}",
@@ -117,8 +118,11 @@ class Track:
                 "The method diverged: lower its gain, or check the assumed standard deviations.",
             )
         if self.covariance is not None:
-            present = self.covariance if self.absent is None else self.covariance[:, there]
-            self._note_unsound(present.reshape(-1, 3, 3))
+            from ..kernels.covariances import unsound
+
+            present = (self.covariance if self.absent is None else self.covariance[:, there]).reshape(-1, 3, 3)
+            if (count := unsound(present)) and not any(UNSOUND in note for note in self.notes):
+                self.__dict__["notes"] = (*self.notes, f"{count} of {len(present)} {UNSOUND}")
 
     def to_frame(self) -> "pd.DataFrame":
         r"""A row per run, step and ego, for pandas.
@@ -146,13 +150,6 @@ class Track:
         if self.heading_covariance is not None:
             columns["std_heading"] = np.sqrt(self.heading_covariance[..., 3])
         return long_table("Track.to_frame", columns | {k: v for k, v in self.extras.items() if v.ndim == 3})
-
-    def _note_unsound(self, covariance: Floats) -> None:
-        from ..kernels.covariances import unsound
-
-        if (count := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
-            note = f"{count} of {len(covariance)} {UNSOUND}"
-            self.__dict__["notes"] = (*self.notes, note)
 
 
 def of_recording(track: Track, recording: Recording) -> None:
@@ -183,12 +180,10 @@ def silent_track(
     cov: Floats | None,
     began: float,
     notes: tuple[str, ...],
-    **more: Any,
 ) -> Track:
     """Track of a method that receives and sends nothing."""
     none = np.zeros((recording.runs, len(columns)))
-    took, notes = clock() - began, (*dict.fromkeys(notes + recording.unlikely),)
-    return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
+    return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
 
 @runtime_checkable

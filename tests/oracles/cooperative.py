@@ -16,22 +16,18 @@ from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
 from coopoc.kernels.odometry_fault import DECISIVE
-from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
-from coopoc.kernels.stars.cooperative_state import (
-    ACCELERATION,
-    CHANGES,
-    CONTRADICTED,
-    ESTABLISHED,
-    LONGEST,
+from coopoc.kernels.stars.cooperative_members import CHANGES, CONTRADICTED, WIDEST
+from coopoc.kernels.stars.cooperative_messages import (
+    CLIP,
+    FADES,
+    FIX_SCORE,
     PENALTY,
     REVOKE,
     SHARE,
     SURE,
-    TAU,
-    WIDEST,
-    WILD,
     WINDOW,
 )
+from coopoc.kernels.stars.cooperative_state import ACCELERATION, ESTABLISHED, LONGEST, TAU, WILD
 from coopoc.kernels.stars.otherwise import (
     AGREEING,
     FASTEST,

@@ -30,12 +30,11 @@ def _dot(first: Number, a: Numbers, b: Numbers) -> Number:
     return first
 
 
-def _rounded(a: Numbers, b: Numbers) -> Number:
-    """a b, every product and sum rounded by itself."""
-    total = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        total = total + x * y
-    return total
+def _rounded(first: Number, a: Numbers, b: Numbers) -> Number:
+    """first + a b, every product and sum rounded by itself."""
+    for x, y in zip(a, b, strict=True):
+        first = first + x * y
+    return first
 
 
 @unrolled
@@ -72,6 +71,12 @@ def negate(a: Any) -> Any:
 def times(a: Any, b: Any) -> Any:
     """a_i b_i."""
     return [x * y for x, y in zip(a, b, strict=True)]
+
+
+@unrolled
+def inner_product(a: Any, b: Any) -> Any:
+    """The sum of a_i b_i, every product and sum rounded by itself."""
+    return _rounded(a[0] * b[0], a[1:], b[1:])
 
 
 @unrolled
@@ -157,19 +162,14 @@ def less_transposed_applied(t: Any, a: Any, v: Any) -> Any:
 def apply(a: Any, v: Any) -> Any:
     """A v, every product and sum rounded by itself."""
     d = len(v)
-    return [_rounded(a[i * d : i * d + d], v) for i in range(d)]
+    return [_rounded(a[i * d] * v[0], a[i * d + 1 : i * d + d], v[1:]) for i in range(d)]
 
 
 @unrolled
 def plus_applied(t: Any, a: Any, v: Any) -> Any:
     """t + A v, every product and sum rounded by itself."""
-    d, out = len(v), []
-    for i in range(d):
-        total = t[i]
-        for k in range(d):
-            total = total + a[i * d + k] * v[k]
-        out.append(total)
-    return out
+    d = len(v)
+    return [_rounded(t[i], a[i * d : i * d + d], v) for i in range(d)]
 
 
 @unrolled

@@ -41,6 +41,11 @@ class _Model(models.PrimitiveModel):
 BATCHED = Batched()
 
 
+def _instruction(name: str) -> Callable[["Number", "Number | float"], "Number"]:
+    """The operator that an LLVM instruction of two numbers is."""
+    return lambda a, b: a.apply(lambda build, *values: getattr(build, name)(*values), b)
+
+
 @dataclass(frozen=True, eq=False)
 class Number:
     """A number of the kernel that is being compiled; without a builder only its type is known."""
@@ -80,17 +85,8 @@ class Number:
 
         return self.apply(make, *others)
 
-    def __add__(self, other: "Number | float") -> "Number":
-        return self.apply(lambda build, a, b: build.fadd(a, b), other)
-
-    def __sub__(self, other: "Number | float") -> "Number":
-        return self.apply(lambda build, a, b: build.fsub(a, b), other)
-
-    def __mul__(self, other: "Number | float") -> "Number":
-        return self.apply(lambda build, a, b: build.fmul(a, b), other)
-
-    def __truediv__(self, other: "Number | float") -> "Number":
-        return self.apply(lambda build, a, b: build.fdiv(a, b), other)
+    __add__, __sub__ = _instruction("fadd"), _instruction("fsub")
+    __mul__, __truediv__ = _instruction("fmul"), _instruction("fdiv")
 
     def __neg__(self) -> "Number":
         return self.apply(lambda build, a: build.fneg(a))

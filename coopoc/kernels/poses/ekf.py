@@ -120,7 +120,7 @@ def step(
     for k in range(measured.own.shape[2]):
         own, member = measured.own[run, t, k], d * k
         if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
-            predict(poses, member, d, (own[4], own[5], own[6]), own[7], measured.dt, noise)
+            predict(poses, member, d, own[4:7], own[7], measured.dt, noise)
         elif measured.active[t, k]:
             join(poses, member, d, own, noise)
             again = 0
@@ -133,7 +133,7 @@ def step(
     for k in range(measured.own.shape[2]):
         own = measured.own[run, t, k]
         if measured.active[t, k] and not math.isnan(own[0]):
-            update_fix(poses, d * k, (own[0], own[1], own[2]), noise.fix, noise.gate)
+            update_fix(poses, d * k, own, noise.fix, noise.gate)
         if measured.active[t, k] and not math.isnan(own[3]):
             update_heading(poses, d * k, own[3], noise.heading, noise.gate)
     apply_pending_rows(poses)
@@ -177,8 +177,7 @@ def add_relative(
     measured: PoseMeasurements, noise: PoseNoise, poses: Poses, ends: tuple[int, int], run: int, k: int, left_out: int
 ) -> int:
     """Relative measurement k of members at `ends`."""
-    landmark = (measured.landmark[k, 0], measured.landmark[k, 1], measured.landmark[k, 2])
-    relative = (measured.relative[run, k, 0], measured.relative[run, k, 1], measured.relative[run, k, 2])
+    landmark, relative = measured.landmark[k], measured.relative[run, k]
     return update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, left_out)
 
 

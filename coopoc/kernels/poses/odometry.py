@@ -42,7 +42,7 @@ class PoseNoise(NamedTuple):
 
 
 @part
-def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt: float, noise: PoseNoise) -> None:
+def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt: float, noise: PoseNoise) -> None:
     """Move one member by its odometry.
 
     th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) u / (1 + s), and P' = F P F^T + G Q G^T with the
@@ -57,7 +57,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
         dt: s.
         noise: that is assumed.
     """
-    x, cov, (forward, left, up) = poses.x, poses.cov, velocity
+    x, cov, forward, left, up = poses.x, poses.cov, velocity[0], velocity[1], velocity[2]
     square, q = poses.pace[0, member : member + 3], poses.pace[1, member : member + 3]
     process_variance(noise.odometer, square, velocity, 1.0, q)
     keep_pace(square, velocity, dt)

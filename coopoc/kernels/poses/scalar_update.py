@@ -147,7 +147,7 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
         total += e * columns[q, k + OFFSET]
     if o >= 0:
         total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
-    return float(total)
+    return total
 
 
 @part
@@ -186,7 +186,7 @@ def update_heading(poses: Poses, member: int, heading: float, variance: float, g
 
 
 @part
-def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: float) -> None:
+def update_fix(poses: Poses, member: int, fix: Floats, variance: Three, gate: float) -> None:
     """A position m, gated as a whole."""
     share, m, cov, hits = 1.0, member, poses.cov, poses.hits
     if math.isfinite(gate):
@@ -225,8 +225,8 @@ def relative_row(polar: Numbers, heading: float, component: int, measured: float
 def update_relative(
     poses: Poses,
     ends: Ends,
-    landmark: Three,
-    measured: Three,
+    landmark: Floats,
+    measured: Floats,
     variances: Three,
     gate: float,
     longer: float,
@@ -247,10 +247,9 @@ def update_relative(
     Returns:
         The bits, and those of the components that are rejected.
     """
-    (k, o), (px, py, pz), x, linear = ends, landmark, poses.x, poses.linear
-    if o >= 0:
-        px, py, pz = linear[o], linear[o + 1], linear[o + 2]
-    polar = direction(px - linear[k], py - linear[k + 1], pz - linear[k + 2])
+    (k, o), x, linear = ends, poses.x, poses.linear
+    place = landmark if o < 0 else linear[o : o + 3]
+    polar = direction(place[0] - linear[k], place[1] - linear[k + 1], place[2] - linear[k + 2])
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):
             continue

@@ -25,7 +25,6 @@ from .cooperative_state import (
     BY_FIXES,
     CLOCK,
     CORRECTED,
-    COVARIANCE,
     DT,
     EXTRA_VARIANCE,
     FIX,
@@ -41,13 +40,11 @@ from .cooperative_state import (
     MORE,
     MOTION,
     MOTION_VARIANCE,
-    ODOMETER,
     ORDER,
     OUT,
     OWN,
     SINCE_FIX,
     SOLO,
-    SOLO_VARIANCE,
     SPAN,
     SPEED,
     STEP,
@@ -61,7 +58,6 @@ from .cooperative_state import (
     WIDTH,
     Filter,
     Model,
-    Sent,
     begin,
     copy_filter,
     is_placed,
@@ -82,6 +78,8 @@ from .gaussian import (
     VARIANCE,
     Q,
     Z,
+    add_term,
+    begin_rows,
     clear,
     correct,
     expect,
@@ -120,6 +118,7 @@ from .otherwise import (
     copy_rows,
     corrected,
     corrected_motion,
+    ego_variance,
     gap_to_fix,
     learn_fix,
     learn_relative,
@@ -136,98 +135,87 @@ from .otherwise import (
 
 @compiled
 def run_filter(
-    measurements: Measurements, assumed: Assumptions, sent: Sent, odometry: Floats, model: Model
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
-    (R, M, 6) of range, azimuth, inclination and message, NaN for none, whether the neighbour is trusted, and by how
-    many s its clock is ahead.
+    measurements: Measurements, assumed: Assumptions, sent: Floats, odometry: Floats, model: Model
+) -> tuple[Floats, Floats]:
+    """Of the ego (R, T, 1 + FOUND + 12) the weight of its fix, what is otherwise than assumed, its position m and
+    covariance m^2; by link (R, M, 9) the neighbour's position m, the weights of range, azimuth, inclination and
+    message, NaN for none, whether it is trusted, and by how many s its clock is ahead.
 
     NaN until a fix, or what a neighbour sends and the ego measures of it, shows where the ego is.
 
     Args:
         measurements: measurements and messages of the ego.
         assumed: process noise, and the variance of fixes.
-        sent: in messages.
-        odometry: (R, T, 4) m and m^2, by how much fixes correct the ego's motion, and its variance is larger
-            then; of no length where its odometry never fails.
+        sent: of `fading_memory`.
+        odometry: (R, T, 4) m and m^2, by how much fixes correct the ego's motion, and its variance is larger then.
         model: noise model.
     """
     runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
-    links, most = measurements.relative.shape[1], 0
-    for t in range(steps):
-        most = max(most, measurements.start[t + 1] - measurements.start[t])
-    x, cov = np.full((runs, steps, 3), math.nan), np.full((runs, steps, 3, 3), math.nan)
-    fixes, deviations = np.full((runs, steps), math.nan), np.full((runs, steps, FOUND), math.nan)
-    neighbours, notes = np.full((runs, links, 3), math.nan), np.full((runs, links, 6), math.nan)
+    most, of_ego = measurements.most, np.full((runs, steps, FOUND + 13), math.nan)
+    by_link = np.full((runs, measurements.relative.shape[1], 9), math.nan)
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
-        f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
+        f, tries = new_filter(most, vehicles), new_tries(most, vehicles)
         for t in range(steps):
-            first = measurements.start[t]
-            count = measurements.start[t + 1] - first
-            gather_own(own, measurements, assumed, model.white, run, t)
-            for i in range(4 if len(odometry) else 0):
-                own[BY_FIXES + i] = odometry[run, t, i]
-            measured_motion(own)
-            for i in range(count):
-                who[i] = measurements.neighbour[first + i]
-                gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
+            count = gather(own, rows, who, measurements, assumed, sent, odometry, model.white, run, t)
             if f.g.vectors[0] == 0:
                 if not is_placed(own, rows, count):
                     continue
                 begin(f, model, own, rows, count, measurements.ego)
             step(f, tries, model, own, rows, who, count)
-            fixes[run, t] = f.member[0, OUT + 3]
-            for i in range(FOUND):
-                deviations[run, t, i] = f.ego[TOLD + i]
-            for c in range(3):
-                x[run, t, c] = f.ego[ANSWER + c]
-                for d in range(3):
-                    cov[run, t, c, d] = f.ego[COVARIANCE + 3 * c + d]
+            of_ego[run, t, 0] = f.member[0, OUT + 3]
+            for i in range(FOUND + 12):
+                of_ego[run, t, 1 + i] = f.ego[TOLD + i]
             for i in range(count):
-                k = f.slot[who[i]]
+                k, answer = f.slot[who[i]], by_link[run, measurements.start[t] + i]
                 if k < 0:  # the star was left
                     continue
                 for c in range(3):
-                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
-                    notes[run, first + i, c] = weight(f.member[k, OUT + c], model.gate)
-                notes[run, first + i, 3] = f.member[k, OUT + 3]
-                notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-                notes[run, first + i, 5] = clock_of(f, model, k)
-    return x, cov, neighbours, fixes, notes, deviations
+                    answer[c], answer[3 + c] = f.member[k, AT + c], weight(f.member[k, OUT + c], model.gate)
+                answer[6], answer[7] = f.member[k, OUT + 3], f.status[who[i], TRUSTED]
+                answer[8] = clock_of(f, model, k)
+    return of_ego, by_link
 
 
 @inside
-def gather_own(own: Floats, measurements: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
-    """The ego's fix and motion at a step."""
-    u, r = measurements.velocity[run, t, measurements.ego], three_of(assumed.fixes, run, t, measurements.ego)
-    q, own[DT] = three_of(assumed.process, run, t, measurements.ego), measurements.dt
+def gather(
+    own: Floats,
+    rows: Floats,
+    who: Ints,
+    measurements: Measurements,
+    assumed: Assumptions,
+    sent: Floats,
+    odometry: Floats,
+    white: Floats,
+    run: int,
+    t: int,
+) -> int:
+    """Fill the ego's row of a step, and its neighbours', with the newest message of each; how many these are."""
+    ego, dt, first = measurements.ego, measurements.dt, measurements.start[t]
+    u, r = measurements.velocity[run, t, ego], three_of(assumed.fixes, run, t, ego)
+    q, own[DT] = three_of(assumed.process, run, t, ego), dt
     for c in range(3):
-        own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, measurements.ego, c], r[c] * white[c]
-        own[MOTION + c], own[MOTION_VARIANCE + c] = measurements.dt * u[c], q[c]
-
-
-@inside
-def gather_neighbour(
-    rows: Floats, measurements: Measurements, assumed: Assumptions, sent: Sent, run: int, t: int, link: int, i: int
-) -> None:
-    """The measurement of a neighbour, and the newest message held."""
-    for c in range(5):
-        rows[i, c] = measurements.relative[run, link, c]
-    j, when = measurements.neighbour[link], measurements.newest[run, link]
-    rows[i, AGE] = (t - when) * measurements.dt if when >= 0 else -1.0
-    if when < 0:
-        return
-    u, q = measurements.velocity[run, when, j], three_of(assumed.process, run, when, j)
-    fix = three_of(assumed.fixes, run, when, j)
-    x, p, s = (
-        three_of(sent.position, j, run, when),
-        three_of(sent.variance, j, run, when),
-        three_of(sent.odometer, j, run, when),
-    )
-    for c in range(3):
-        rows[i, SOLO + c], rows[i, SOLO_VARIANCE + c], rows[i, ODOMETER + c] = x[c], p[c], s[c]
-        rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
+        own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, ego, c], r[c] * white[c]
+        own[MOTION + c], own[MOTION_VARIANCE + c] = dt * u[c], q[c]
+    for i in range(4):
+        own[BY_FIXES + i] = odometry[run, t, i]
+    measured_motion(own)
+    count = measurements.start[t + 1] - first
+    for i in range(count):
+        link = first + i
+        for c in range(5):
+            rows[i, c] = measurements.relative[run, link, c]
+        who[i], when = measurements.neighbour[link], measurements.newest[run, link]
+        rows[i, AGE] = (t - when) * dt if when >= 0 else -1.0
+        if when < 0:
+            continue
+        u, q = measurements.velocity[run, when, who[i]], three_of(assumed.process, run, when, who[i])
+        fix = three_of(assumed.fixes, run, when, who[i])
+        for c in range(9):
+            rows[i, SOLO + c] = sent[who[i], run, when, c]
+        for c in range(3):
+            rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
+    return count
 
 
 @inner
@@ -342,8 +330,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
         for c in range(4):
             f.member[k, OUT + c] = math.nan
     add_fix(f, model, own)
-    locate(f)
-    members = nearest_first(f)
+    members = locate(f)
     for i in range(members):
         k = f.who[i, ORDER]
         new = f.member[k, EXTRA_VARIANCE] > 0.0 and rows[f.who[k, INPUT], AGE] >= 0.0
@@ -351,38 +338,32 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
             receive(f, model, rows, k)
         goes_on(f, rows, k)
     locate(f)
-    members = nearest_first(f)
     measure(f, model, rows, members)
     for i in range(members):
         receive(f, model, rows, f.who[i, ORDER])
         goes_on(f, rows, f.who[i, ORDER])
     if model.fix_gate > 0.0:
         trust(f, model)
+    locate(f)
     f.ego[STEPS] += 1
     corrected(f)
     adapt(f, model)
 
 
 @part
-def locate(f: Filter) -> None:
-    """Relative measurements are linear where the members are now."""
-    g = f.g
+def locate(f: Filter) -> int:
+    """Where the members are now, and, nearest first, which there are; how many."""
+    g, members = f.g, 0
     for k in range(len(f.who)):
-        if f.who[k, VEHICLE] >= 0:
-            for c in range(3):
-                f.member[k, AT + c] = g.x[3 * g.block[k, PLACE] + c] + f.member[k, WAY + c]
-
-
-@inside
-def nearest_first(f: Filter) -> int:
-    """Sort the members by their distance; how many there are."""
-    members = 0
-    for k in range(1, len(f.who)):
-        if f.who[k, VEHICLE] >= 0:
-            i = members
-            while i > 0 and gap2(f, f.who[i - 1, ORDER]) > gap2(f, k):
-                f.who[i, ORDER] = f.who[i - 1, ORDER]
-                i -= 1
+        if f.who[k, VEHICLE] < 0:
+            continue
+        for c in range(3):
+            f.member[k, AT + c] = g.x[3 * g.block[k, PLACE] + c] + f.member[k, WAY + c]
+        i = members
+        while i > 0 and gap2(f, f.who[i - 1, ORDER]) > gap2(f, k):
+            f.who[i, ORDER] = f.who[i - 1, ORDER]
+            i -= 1
+        if k > 0:
             f.who[i, ORDER] = k
             members += 1
     return members
@@ -434,7 +415,7 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
     if what == BEGIN:
         for c in range(3):
             left[c] = g.x[c]
-        left[3], left[6] = (g.p[0, 0] + g.p[1, 1] + g.p[2, 2]) / 3.0, 0.0
+        left[3], left[6] = ego_variance(f) / 3.0, 0.0
         return False
     if what == BACK:
         clear(g, 0)
@@ -514,29 +495,19 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     store(h.three, Z // 3, (d, turned * flat + b, raised * reach + c))
     a, b, c = (std[0], std[1] * flat, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
     store(h.three, VARIANCE // 3, (a * a, b * b, c * c))
-    store(h.matrix, 0, w)
-    store(h.matrix, 1, negate(w))
-    store(h.matrix, 2, (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
         h.three[VARIANCE + c] *= math.exp(f.ego[LEVEL + c])
         h.three[LIMIT + c] = model.gate
-    h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
-    h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
-    add_ranged(f, 0, far)
-    add_ranged(f, k, 1.0)
+    begin_rows(h)
+    add_term(h, g.block[k, PLACE], w)
+    add_term(h, g.block[0, PLACE], negate(w))
+    add_term(h, g.block[0, COMPASS], (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
+    add_term(h, g.block[0, RANGED], (far, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    add_term(h, g.block[k, RANGED], (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     h.three[CURVE] = 1.0 / (reach * reach) if model.gate > 0.0 else 0.0
     if goes_on(f, rows, k):
         add_way(f, rows, k)
     return True
-
-
-@part
-def add_ranged(f: Filter, k: int, factor: float) -> None:
-    """Row of a range's error that is `factor` times that of slot k, if it has one."""
-    if has(f.g, k, RANGED):
-        n = f.h.block[TERMS]
-        store(f.h.matrix, n, (factor, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        f.h.block[n], f.h.block[TERMS] = f.g.block[k, RANGED], n + 1
 
 
 @part

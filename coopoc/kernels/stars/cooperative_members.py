@@ -7,9 +7,7 @@ from ..compiling.compile import inside, part
 from .cooperative_state import (
     ACCELERATION,
     AGE,
-    CHANGES,
     CLOCK,
-    CONTRADICTED,
     DT,
     EXTRA_VARIANCE,
     FIX,
@@ -22,7 +20,6 @@ from .cooperative_state import (
     MOTION_VARIANCE,
     PACE,
     SINCE,
-    SLIPPED,
     SLIPS,
     SPAN,
     SPEED,
@@ -32,23 +29,41 @@ from .cooperative_state import (
     VEHICLE,
     WAY,
     WHEN,
-    WIDEST,
     WILD,
     Filter,
     Model,
-    insert_turn,
     measured_vector,
     measured_whole,
     needs_restart,
-    reset_bias,
+    set_trust,
     start,
 )
-from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, RANGED, has, insert, remove, shift, widen
+from .gaussian import (
+    ABSENT,
+    COMMON,
+    ERROR,
+    KINDS,
+    PLACE,
+    RANGED,
+    TURN,
+    has,
+    insert,
+    insert_error,
+    remove,
+    stretch,
+    widen,
+)
 from .messages import vector_at
 from .otherwise import drive, slip
 
 PAIR_TIME = 60.0
 """s, in which an offset of a pair's ranges changes."""
+CONTRADICTED = 30.0
+"""Steps in a row at most after which a member that is contradicted joins anew."""
+SLIPPED = 5.0
+"""Implausible velocities in a row after which one counts again."""
+CHANGES, WIDEST = 20.0, 9.0
+"""Velocities in the level of their noise, fewer at first, and the most of a squared normalised change that counts."""
 
 
 @inside
@@ -69,7 +84,7 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
         if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
         if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
-            reset_bias(f, model, j)
+            set_trust(f, j, 0.0, TAU**2 + model.own)
         for kind in range(KINDS):
             remove(f.g, k, kind)
         f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
@@ -85,32 +100,32 @@ def contradicted(f: Filter, k: int) -> bool:
         several += hits >= 3
         if hits >= min(CONTRADICTED, max(2, since - hits)):
             return True
-    return bool(several >= 2)
+    return several >= 2
 
 
 @inside
 def predict(f: Filter, model: Model, own: Floats) -> None:
     """Move the ego; errors that last decay, errors of which nothing is known change."""
-    g, first = f.g, 3 * f.g.block[0, PLACE]
+    g = f.g
     keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
     fades = 1.0 - keep * keep
     drive(f, model, 0, vector_at(own, MOTION // 3), own[DT])
     for c in range(3):
-        g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
+        g.p[c, c] += own[MOTION_VARIANCE + c]
     slip(f, model, own)
     for k in range(len(f.who)):
         if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
             if trusted:
-                shift(g, i, i, keep - 1.0)
+                stretch(g, i, keep - 1.0)
             widen(g, i, model.own * fades)
         if k > 0 and f.who[k, VEHICLE] >= 0 and has(g, k, RANGED):
             i, holds = 3 * g.block[k, RANGED], math.exp(-own[DT] / PAIR_TIME)
-            shift(g, i, i, holds - 1.0)
+            stretch(g, i, holds - 1.0)
             g.p[i, i] += (1.0 - holds * holds) * model.ranged[1]
     if model.common > 0.0:
         i = 3 * g.block[0, COMMON]
-        shift(g, i, i, keep - 1.0)
+        stretch(g, i, keep - 1.0)
         widen(g, i, model.common * fades)
 
 
@@ -152,11 +167,10 @@ def replace_implausible_velocity(
 def stand(f: Filter, rows: Floats, k: int) -> None:
     """Move a member of whose position nothing is known to where the ego measures it, or, where a component is missing,
     somewhere near: its measurement is linear there."""
-    g, row = f.g, f.who[k, INPUT]
-    ego, first = 3 * g.block[0, PLACE], 3 * g.block[k, PLACE]
+    g, row, first = f.g, f.who[k, INPUT], 3 * f.g.block[k, PLACE]
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):
-        g.x[first + c] = g.x[ego + c] + (measured_vector(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
+        g.x[first + c] = g.x[c] + (measured_vector(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
 
 
 @part
@@ -171,15 +185,12 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
     f.member[k, WHEN] = f.ego[CLOCK] - age
     for c in range(3):
         f.who[k, HITS + c], f.member[k, WAY + c] = 0, 0.0
-    first = insert(g, k, PLACE, 0.0)
+    first = insert(g, k, PLACE)
     stand(f, rows, k)
     if age > 0.0:
         for c in range(3):
             g.x[first + c] -= age * rows[row, SPEED + c]
-    insert_turn(g, model, k)
-    if model.ranged[1] > 0.0:
-        i = insert(g, k, RANGED, 0.0)
-        g.p[i, i] = model.ranged[1]
+    insert_error(g, k, TURN, vector_at(model.turn, 0))
+    insert_error(g, k, RANGED, (model.ranged[1], 0.0, 0.0))
     variance = model.own + (TAU**2 if f.status[vehicle, TRUSTED] == 0.0 else 0.0)
-    if variance > 0.0:
-        insert(g, k, ERROR, variance)
+    insert_error(g, k, ERROR, (variance, variance, variance))

@@ -31,17 +31,13 @@ from .cooperative_state import (
     ODOMETER,
     OUT,
     PACE,
-    PENALTY,
-    REVOKE,
     REVOKED,
-    SHARE,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
     SPAN,
     SPEED,
     STEP,
-    SURE,
     TAU,
     TRUSTED,
     TYPICAL,
@@ -49,10 +45,9 @@ from .cooperative_state import (
     VEHICLE,
     WAY,
     WHEN,
-    WINDOW,
     Filter,
     Model,
-    reset_bias,
+    set_trust,
 )
 from .gaussian import (
     ABSENT,
@@ -60,20 +55,20 @@ from .gaussian import (
     COV,
     ERROR,
     GAP,
+    IDENTITY,
     MEASURED,
     PLACE,
     SQUARE,
-    TERMS,
     TURN,
     VARIANCE,
+    add_term,
+    begin_rows,
     correct,
     distance,
     expect,
-    has,
     innovate,
     insert_from_measurement,
     remove,
-    term,
     update,
 )
 from .messages import block_at, three_of, vector_at
@@ -87,23 +82,27 @@ CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 FIX_SCORE = 16.0
 """Most of a squared Mahalanobis distance of a fix that tells of a slip."""
+SHARE = 0.1
+"""Prior share of vehicles whose receiver errs: of 0.05 to 0.3 no world is told apart."""
+SURE, PENALTY, REVOKE = 2.0, 4.0, 2.0
+"""Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
+WINDOW = 30.0
+"""Fixes in the mean innovation of a vehicle."""
 
 
 @inside
 def fix_terms(f: Filter, k: int) -> None:
     """Position of member k, error of its fixes, and the one that all share."""
-    g, n = f.g, 1
-    term(f.h, 0, g.block[k, PLACE], 1.0)
-    if has(g, k, ERROR):
-        term(f.h, n, g.block[k, ERROR], 1.0)
-        n += 1
-    if has(g, 0, COMMON):
-        term(f.h, n, g.block[0, COMMON], 1.0)
+    block = f.g.block
+    begin_rows(f.h)
+    add_term(f.h, block[k, PLACE], IDENTITY)
+    add_term(f.h, block[k, ERROR], IDENTITY)
+    add_term(f.h, block[0, COMMON], IDENTITY)
 
 
 @compiled
-def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -> tuple[Floats, Floats, Floats]:
-    """What vehicles send: (N, R, T, 3) mean of fixes m, its variance m^2, and odometer m, as `remember` writes them.
+def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -> Floats:
+    """What vehicles send: (N, R, T, 9) mean of fixes m, its variance m^2, and odometer m, as `remember` writes them.
 
     Args:
         gnss: (R, T, N, 3) m, NaN for none.
@@ -112,9 +111,7 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
         dt: s.
     """
     runs, steps, vehicles = gnss.shape[:3]
-    shape = vehicles, runs, steps, 3
-    position, spread, odometer = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    memory, moved, r = np.zeros(9), np.zeros(3), np.zeros(3)
+    sent, memory, moved, r = np.zeros((vehicles, runs, steps, 9)), np.zeros(9), np.zeros(3), np.zeros(3)
     for j in range(vehicles):
         for run in range(runs):
             memory[:] = 0.0
@@ -124,10 +121,9 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
                 if math.isnan(moved[0]):
                     memory[3:6], moved[:] = 0.0, 0.0
                 remember(memory, moved, gnss[run, t, j], r, dt)
-                for c in range(3):
-                    position[j, run, t, c], odometer[j, run, t, c] = memory[c], memory[6 + c]
-                    spread[j, run, t, c] = 1.0 / max(memory[3 + c], 1e-300)
-    return position, spread, odometer
+                for i in range(9):
+                    sent[j, run, t, i] = 1.0 / max(memory[i], 1e-300) if i // 3 == 1 else memory[i]
+    return sent
 
 
 @inside
@@ -204,11 +200,8 @@ def message_rows(
     long = 1.0 / (1.0 - fade * fade)
     way = (steps - 1.0 / steps) / 12.0 if follows else min((steps - 1.0) * (2.0 * steps - 1.0) / (6.0 * steps), long)
     fix_terms(f, k)
-    if has(f.g, k, TURN):  # of a clock that is ahead
-        n = h.block[TERMS]
-        x, y, z = vector_at(rows[row], SPEED // 3)
-        store(h.matrix, n, (0.0, 0.0, -x, 0.0, 0.0, -y, 0.0, 0.0, -z))
-        h.block[n], h.block[TERMS] = f.g.block[k, TURN], n + 1
+    x, y, z = vector_at(rows[row], SPEED // 3)  # of a clock that is ahead
+    add_term(h, f.g.block[k, TURN], (0.0, 0.0, -x, 0.0, 0.0, -y, 0.0, 0.0, -z))
     for c in range(3):
         weight, r = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c]
         old = keep / status[LAST + 3 + c] if again else 0.0
@@ -236,7 +229,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
-    return bool(age > ROUNDING)
+    return age > ROUNDING
 
 
 @inner
@@ -262,7 +255,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        reset_bias(f, model, j)
+        set_trust(f, j, 0.0, TAU**2 + model.own)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             f.member[0, LOCKED] = 0.0
             fix_terms(f, 0)
@@ -326,7 +319,7 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
         return False
     tau2 = TAU**2
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
-    return bool(odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE)
+    return odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE
 
 
 @part
@@ -359,10 +352,11 @@ def trust(f: Filter, model: Model) -> None:
             return
         j = f.who[best, VEHICLE]
         f.status[j, TRUSTED], f.status[j, COUNT] = 1.0, 0.0
-        term(h, 0, g.block[best, ERROR], 1.0)
+        begin_rows(h)
+        add_term(h, g.block[best, ERROR], IDENTITY)
         for c in range(3):
             expect(h, c, 0.0, max(narrow, 1e-6))
             f.status[j, MEAN + c] = 0.0
-        update(g, h, 0.0)
+        update(g, h)
         if model.own == 0.0:
             remove(g, best, ERROR)

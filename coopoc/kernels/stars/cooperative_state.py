@@ -26,11 +26,13 @@ from .gaussian import (
     Rows,
     clear,
     insert,
+    insert_error,
     new_gaussian,
     new_rows,
     remove,
     widen,
 )
+from .messages import vector_at
 
 FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, OWN = 0, 3, 6, 9, 12, 13, 16, 17
 """Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
@@ -45,42 +47,17 @@ motion with it m^2, when that was s (-inf for never), how many in a row were not
 share of what is assumed the variance of its velocities is more."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
-SLIPPED, WILD = 5.0, 32.0
-"""Implausible velocities in a row after which one counts again, and the squared normalised distance from which a
-velocity is, or an error of fixes, beyond doubt."""
+WILD = 32.0
+"""Squared normalised distance from which a velocity is implausible, or an error of fixes beyond doubt."""
 ESTABLISHED, LONGEST = 60.0, 0.99 * PATIENCE
 """s of agreement with fixes after which a position was no wrong start, and its count of lock-out at which fixes that
 contradict it are taken for noisier ones: it is not left."""
-CHANGES, WIDEST = 20.0, 9.0
-"""Velocities in the level of their noise, fewer at first, and the most of a squared normalised change that counts."""
-
-
-TAU, SHARE = 20.0, 0.1
-"""m, standard deviation of an error of a receiver of which nothing is known, and the prior share of vehicles with one:
-of 0.05 to 0.3 no world is told apart."""
-SURE, PENALTY, REVOKE = 2.0, 4.0, 2.0
-"""Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
-WINDOW, CONTRADICTED = 30.0, 30.0
-"""Fixes in the mean innovation of a vehicle; steps in a row at most after which a member that is contradicted joins
-anew."""
+TAU = 20.0
+"""m, standard deviation of an error of a receiver of which nothing is known."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
 FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 13
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
-
-
-class Sent(NamedTuple):
-    """What is in the messages; arrays are broadcastable to (N, R, T, 3), the vehicles first.
-
-    Attributes:
-        position: m, and
-        variance: m^2, as `fading_memory` writes them.
-        odometer: m, sum of all motions until each step.
-    """
-
-    position: Floats
-    variance: Floats
-    odometer: Floats
 
 
 class Model(NamedTuple):
@@ -154,7 +131,8 @@ them."""
 
 
 class Filter(NamedTuple):
-    """The state of the filter; slot 0 is the ego's, each neighbour has one of the others.
+    """The state of the filter; slot 0 is the ego's, whose position is the first vector; each neighbour has one of the
+    others.
 
     Each array that a function gets takes time to compile: what is of one thing is in one.
 
@@ -229,26 +207,12 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
     f.ego[LEFT + 3] = NOTHING
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
-    insert(f.g, 0, PLACE, 0.0)
-    if model.common > 0.0:
-        insert(f.g, 0, COMMON, model.common)
-    if model.bias + model.heading + model.offset > 0.0:
-        first = insert(f.g, 0, COMPASS, model.bias)
-        f.g.p[first + 2, first + 2] = model.offset
-    if model.ranged[0] > 0.0:
-        first = insert(f.g, 0, RANGED, 0.0)
-        f.g.p[first, first] = model.ranged[0]
-    insert_turn(f.g, model, 0)
+    insert(f.g, 0, PLACE)
+    insert_error(f.g, 0, COMMON, (model.common, model.common, model.common))
+    insert_error(f.g, 0, COMPASS, (model.bias, model.heading, model.offset))
+    insert_error(f.g, 0, RANGED, (model.ranged[0], 0.0, 0.0))
+    insert_error(f.g, 0, TURN, vector_at(model.turn, 0))
     start(f, model, own, rows, count)
-
-
-@part
-def insert_turn(g: Gaussian, model: Model, k: int) -> None:
-    """Give a member errors of heading and scale of its odometry, and of its clock, where there are any."""
-    if model.turn[0] + model.turn[1] + model.turn[2] > 0.0:
-        i = insert(g, k, TURN, 0.0)
-        for c in range(3):
-            g.p[i + c, i + c] = model.turn[c]
 
 
 @part
@@ -279,13 +243,10 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
         0.0,
     )
     f.ego[AGREED] = 0.0
-    f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     clear(g, 0)
-    remove(g, 0, ERROR)
-    if model.own > 0.0:
-        insert(g, 0, ERROR, model.own)
+    set_trust(f, ego, 1.0, model.own)
     for c in range(3):
-        g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
+        g.x[c] = own[FIX + c]
         f.ego[LEFT + c] += own[MOTION + c]
     if own_votes <= 1 and best >= 0:
         f.member[0, EXTRA_VARIANCE] = 0.0
@@ -311,14 +272,14 @@ def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
     hits = f.who[0, HITS]
     if f.status[ego, TRUSTED] > 0.0:
         young = f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
-        return bool((hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE))
+        return (hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE)
     far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):
         far, noise = far + f.g.x[first + c] ** 2, noise + own[FIX_VARIANCE + c] / 3.0
         between += (f.g.x[first + c] - f.g.x[other + c]) ** 2
     agree = far > FIX_GATE * noise and between < FIX_GATE * noise
-    return bool(others >= 2 or (others == 1 and (far > WILD * noise or agree)))
+    return others >= 2 or (others == 1 and (far > WILD * noise or agree))
 
 
 @part
@@ -331,14 +292,14 @@ def is_placed(own: Floats, rows: Floats, count: int) -> bool:
 
 
 @part
-def reset_bias(f: Filter, model: Model, j: int) -> None:
-    """The fixes of vehicle j have an error of which nothing is known."""
-    f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
+def set_trust(f: Filter, j: int, trusted: float, variance: float) -> None:
+    """Trust the fixes of vehicle j from now on, or not, whose error has that variance, m^2."""
+    f.status[j, TRUSTED], f.status[j, COUNT] = trusted, 0.0
     for c in range(3):
         f.status[j, MEAN + c] = 0.0
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
-        insert(f.g, f.slot[j], ERROR, TAU**2 + model.own)
+        insert_error(f.g, f.slot[j], ERROR, (variance, variance, variance))
 
 
 @part
@@ -364,18 +325,18 @@ def mahalanobis2(own: Floats, rows: Floats, i: int, j: int) -> float:
 def seen_from(rows: Floats, row: int, c: int) -> float:
     """Component c m of where the ego is by a neighbour's message; NaN if that has no position."""
     position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - measured_vector(rows, row, c)
-    return float(position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan)
+    return position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan
 
 
 @part
 def measured_vector(rows: Floats, row: int, c: int) -> float:
     """Component c of the measured vector to a neighbour, m."""
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
+    return d * ci if c == 2 else d * si * (ca if c == 0 else sa)
 
 
 @inside
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
     angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)
-    return bool(rows[row, 0] >= 0.0 and angles)
+    return rows[row, 0] >= 0.0 and angles

@@ -12,9 +12,9 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, times, zeros
+from ..compiling.small import add, add_diagonal, choose_each, inner_product, load, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose, take
-from ..gate import FIX_GATE, INITIAL_LOCKOUT, LEAK, NOTHING, distance, gain_of, gated_update, inflation, remember, total
+from ..gate import FIX_GATE, INITIAL_LOCKOUT, LEAK, NOTHING, distance, gain_of, gated_update, inflation, remember
 from ..geometry import Numbers, axes, direction, incomplete, residuals
 from .messages import (
     BLOCK,
@@ -87,7 +87,7 @@ def go_back(star: Star, gates: Gates, state: Floats) -> float:
     if q <= o + FIX_GATE and o + NOTHING <= spread[0]:
         return o
     gap, other = subtract(there, at), distance(subtract(fix, there), add_diagonal(spread, variance))
-    apart, wide, gain = total(times(gap, gap)), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
+    apart, wide, gain = inner_product(gap, gap), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
     what, evidence, since = remember(q, other, FIX_GATE, gain, apart, wide, memory[12], memory[13])
     begins, back, flat = what - 0.5, what - 1.5, o + NOTHING
     nothing = add_diagonal(zeros(o, BLOCK), (flat, flat, flat))
@@ -149,8 +149,7 @@ def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) ->
     q = distance(subtract(position_of(star, k), at), add_diagonal(cov, variance))
     store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
     gain: float = gain_of(cov, variance)
-    signed: float = choose(q - FIX_GATE, gain, -gain)
-    return signed
+    return choose(q - FIX_GATE, gain, -gain)
 
 
 @inner

@@ -18,12 +18,14 @@ from ..compiling.small import (
     less_transposed_product,
     minus_apply,
     minus_product,
+    negate,
     plus_applied,
     scale,
     store,
     transpose,
 )
 from ..compiling.vectors import LANES, less, plus, put, take
+from ..geometry import Numbers
 from .messages import BLOCK, ROW, block_at, vector_at
 
 PLACE, ERROR, TURN, FRESH, COMMON, COMPASS, RANGED = range(7)
@@ -33,6 +35,7 @@ compass, rad, with the offset m of its ranges, and the error of their scale; of 
 it."""
 KINDS, TERMS = 7, 6
 ABSENT = -1
+IDENTITY: Numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HARD_REJECT_FACTOR = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
 
@@ -97,7 +100,7 @@ def new_rows(members: int) -> Rows:
 @inside
 def lanes(g: Gaussian) -> int:
     """LANES of numbers that hold the vectors in use."""
-    return int((3 * g.vectors[0] + LANES - 1) // LANES)
+    return (3 * g.vectors[0] + LANES - 1) // LANES
 
 
 @inside
@@ -109,17 +112,25 @@ def three_rows(rows: Floats, i: int, wide: int) -> tuple[float, float, float]:
 @part
 def has(g: Gaussian, member: int, kind: int) -> bool:
     """Whether a vector is in the state."""
-    return bool(g.block[member, kind] >= 0)
+    return g.block[member, kind] >= 0
 
 
 @part
-def insert(g: Gaussian, member: int, kind: int, variance: float) -> int:
-    """Put a vector of mean 0 and of that variance behind the others; index of its first number."""
+def insert(g: Gaussian, member: int, kind: int) -> int:
+    """Put a vector of mean and variance 0 behind the others; index of its first number."""
     b = g.vectors[0]
     g.vectors[0] = b + 1
     g.block[member, kind], g.vectors[1 + b] = b, member * KINDS + kind
-    widen(g, 3 * b, variance)
-    return int(3 * b)
+    return 3 * b
+
+
+@part
+def insert_error(g: Gaussian, member: int, kind: int, variance: tuple[float, float, float]) -> None:
+    """Insert a vector of mean 0 and of these variances, unless all are 0: there is no such error."""
+    if variance[0] + variance[1] + variance[2] > 0.0:
+        i = insert(g, member, kind)
+        for c in range(3):
+            g.p[i + c, i + c] = variance[c]
 
 
 @part
@@ -153,16 +164,16 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
 
 
 @part
-def shift(g: Gaussian, i: int, j: int, factor: float) -> None:
-    """x_i += factor x_j of two vectors by their first numbers; of one vector x_i *= 1 + factor."""
+def stretch(g: Gaussian, i: int, more: float) -> None:
+    """Multiply a vector by 1 + more."""
     n = 3 * g.vectors[0]
     for c in range(3):
-        g.x[i + c] += factor * g.x[j + c]
+        g.x[i + c] += more * g.x[i + c]
         for k in range(n):
-            g.p[i + c, k] += factor * g.p[j + c, k]
+            g.p[i + c, k] += more * g.p[i + c, k]
     for k in range(n):
         for c in range(3):
-            g.p[k, i + c] += factor * g.p[k, j + c]
+            g.p[k, i + c] += more * g.p[k, i + c]
 
 
 @inside
@@ -173,11 +184,18 @@ def widen(g: Gaussian, i: int, variance: float) -> None:
 
 
 @inside
-def term(h: Rows, k: int, block: int, weight: float) -> None:
-    """Let the k-th term of the rows be `weight` times a vector, and the last one."""
-    h.block[k], h.three[CURVE], o = block, 0.0, 0.0
-    store(h.matrix, k, (weight, o, o, o, weight, o, o, o, weight))
-    h.block[TERMS] = k + 1
+def begin_rows(h: Rows) -> None:
+    """Let the rows have no term yet."""
+    h.block[TERMS], h.three[CURVE] = 0, 0.0
+
+
+@inside
+def add_term(h: Rows, block: int, w: Numbers) -> None:
+    """Let the rows have another term, W times a vector, if that is in the state."""
+    n = h.block[TERMS]
+    if block >= 0:
+        store(h.matrix, n, w)
+        h.block[n], h.block[TERMS] = block, n + 1
 
 
 @inside
@@ -195,9 +213,10 @@ def weight(q: float, gate: float) -> float:
 
 
 @part
-def update(g: Gaussian, h: Rows, gate: float) -> None:
-    """Kalman update by the rows, as one vector with a gate."""
-    correct(g, h, weight(innovate(g, h), gate))
+def update(g: Gaussian, h: Rows) -> None:
+    """Kalman update by the rows."""
+    innovate(g, h)
+    correct(g, h, 1.0)
 
 
 @inside
@@ -318,7 +337,7 @@ def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> N
         store(h.matrix, k, minus_product(b, block_at(h.matrix, k)))
     store(h.three, Z // 3, minus_apply(b, vector_at(h.three, Z // 3)))
     project(g, h)
-    new = insert(g, member, FRESH, 0.0)
+    new = insert(g, member, FRESH)
     for c in range(3):
         g.x[new + c] = -h.three[GAP + c]
         for j in range(n):
@@ -327,21 +346,22 @@ def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> N
             g.p[new + c, new + d] = h.matrix[COV + 3 * c + d]
             for k in range(3):
                 g.p[new + c, new + d] += b[3 * c + k] * h.three[VARIANCE + k] * b[3 * d + k]
-    term(h, 0, new // 3, 1.0)
-    term(h, 1, position, -1.0)
+    begin_rows(h)
+    add_term(h, new // 3, IDENTITY)
+    add_term(h, position, negate(IDENTITY))
     for c in range(3):
         expect(h, c, 0.0, flat)
-    update(g, h, 0.0)
+    update(g, h)
     remove(g, member, PLACE)
     g.block[member, PLACE], g.vectors[1 + position], g.block[member, FRESH] = position, member * KINDS + PLACE, ABSENT
 
 
 @part
 def distance(s: tuple[float, ...], x: tuple[float, ...]) -> tuple[float, float]:
-    """x^T S^-1 x of a symmetric 3 x 3 matrix S, and its determinant."""
+    """x^T S^-1 x of a symmetric 3 x 3 matrix S, also where x and S have no height, and its determinant."""
     a, b = s[3] / s[0], s[6] / s[0]
     d, cross = s[4] - a * s[3], s[7] - b * s[3]
     c = cross / d
     e, y = s[8] - b * s[6] - c * cross, x[1] - a * x[0]
     z = x[2] - b * x[0] - c * y
-    return x[0] * x[0] / s[0] + y * y / d + z * z / e, s[0] * d * e
+    return x[0] * x[0] / s[0] + y * y / d + (z * z / e if z != 0.0 else 0.0), s[0] * d * e

@@ -52,7 +52,6 @@ from .messages import (
     clear,
     fix_information,
     gather,
-    largest,
     moved_of,
     new_estimates,
     position_of,
@@ -208,8 +207,7 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     near = polar[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
     broadcast = choose_each(new, position_of(star, k), somewhere)
-    position: Numbers = choose_each(missing(polar), broadcast, measured)
-    return position
+    return choose_each(missing(polar), broadcast, measured)
 
 
 @inner
@@ -229,8 +227,7 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
 def placed(joint: Joint, k: int, measured: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
-    share: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
-    return share
+    return max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
 
 
 @inner
@@ -267,31 +264,6 @@ def copy(source: Floats, target: Floats, n: int, stride: int) -> None:
     for i in range(n):
         for j in range(i, n):
             store(target, i * stride + j, block_at(source, i * stride + j))
-
-
-@inside
-def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: float) -> tuple[Numbers, Numbers]:
-    """Information of the converted measurement of member k at the predicted geometry, and what it adds to the
-    information vector: W and W (measured vector - predicted vector)."""
-    polar, gap = load(star.relative, k, RELATIVE), subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
-    weight, eta = converted(gap, polar, len(std) == 0, least)
-    if incomplete(polar):
-        is_placed = placed(joint, k, polar)
-        weight, eta = scale(weight, is_placed), scale(eta, is_placed)
-    return weight, eta
-
-
-@inside
-def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) -> tuple[Numbers, Numbers]:
-    """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
-    polar = load(star.relative, k, RELATIVE)
-    ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
-    gap = add(subtract(vector_at(joint.state, k), vector_at(joint.state, 0)), ahead)
-    weight, eta = exact(gap, polar, least)
-    if incomplete(polar):
-        is_placed = placed(joint, k, polar)
-        weight, eta = scale(weight, is_placed), scale(eta, is_placed)
-    return weight, plus_applied(eta, weight, ahead)
 
 
 @inside
@@ -335,7 +307,7 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
     """
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
-    most = largest(measurements.start)
+    most = measurements.most
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
         star, before, joint, gates = star_within(most), star_within(most), joint_within(most), gates_within(most)
@@ -343,22 +315,22 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
             star, before = before, star
             n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, gates, model, refine, robust, n, old)
-            write(out, joint, first, last, t, measurements.start[t], n)
+            write(out, joint.state, joint.scratch, first, last, t, measurements.start[t], n)
             old = n
     return out
 
 
 @inner
-def write(out: Estimates, joint: Joint, first: int, last: int, t: int, link: int, n: int) -> None:
-    """Copy the estimates of a step in runs first to last; `link` is its first link."""
+def write(out: Estimates, state: Floats, own: Floats, first: int, last: int, t: int, link: int, n: int) -> None:
+    """Copy the estimates of a step, and the ego's covariance, in runs first to last; `link` is its first link."""
     x, cov, neighbours = out
     for lane in range(last - first + 1):
         for i in range(3):
-            x[first + lane, t, i] = joint.state[i, lane]
+            x[first + lane, t, i] = state[i, lane]
             for j in range(3):
-                cov[first + lane, t, i, j] = joint.scratch[3 * min(i, j) + max(i, j), lane]
+                cov[first + lane, t, i, j] = own[3 * i + j, lane]
             for k in range(1, n):
-                neighbours[first + lane, link + k - 1, i] = joint.state[3 * k + i, lane]
+                neighbours[first + lane, link + k - 1, i] = state[3 * k + i, lane]
 
 
 @inner
@@ -418,10 +390,17 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
             for i in range(n):
                 store(eta, i, vector_at(joint.eta, i))
         for k in range(1, n):
+            polar = load(star.relative, k, RELATIVE)
+            gap = subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
+            ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
             if stage == 1:
-                weight, vector = exact_information(star, joint, k, n, model.min_range)
+                weight, vector = exact(add(gap, ahead), polar, model.min_range)
             else:
-                weight, vector = relative_information(star, joint, k, model.relative_std, model.min_range)
+                weight, vector = converted(gap, polar, len(model.relative_std) == 0, model.min_range)
+            if incomplete(polar):
+                is_placed = placed(joint, k, polar)
+                weight, vector = scale(weight, is_placed), scale(vector, is_placed)
+            vector = plus_applied(vector, weight, ahead) if stage == 1 else vector
             add_relative(a, eta, joint.stride, k, n, weight, vector)
         store(joint.scratch, 0, negate(solve(a, joint, eta, n)))
     move(joint, n)

@@ -15,7 +15,7 @@ import math
 from ...arrays import Floats
 from ..compiling.compile import part
 from .cooperative_state import ADDED, CLOCK, COVARIANCE, DT, ERRORS, FIX, FIX_VARIANCE, OUT, Filter
-from .gaussian import COMMON, ERROR, PLACE, has
+from .gaussian import COMMON, ERROR, has
 
 RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
 """Of the ego's fixes: sums of their errors m on each axis and of 1, fading; s since the last one; and number, sum and
@@ -35,7 +35,7 @@ def remember_error(f: Filter, own: Floats) -> None:
         return
     keep = math.exp(-min(ego[WAITED] / SECOND, 1.0))
     for c in range(3):
-        error = own[FIX + c] - g.x[3 * g.block[0, PLACE] + c]
+        error = own[FIX + c] - g.x[c]
         for kind in (ERROR, COMMON):
             error -= g.x[3 * g.block[0, kind] + c] if has(g, 0, kind) else 0.0
         product += error * ego[RECENT + c]

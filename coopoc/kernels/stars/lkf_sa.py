@@ -27,7 +27,6 @@ from .messages import (
     block_at,
     clear,
     gather,
-    largest,
     new_estimates,
     star_within,
     vector_at,
@@ -39,7 +38,7 @@ def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
-    most = largest(measurements.start)
+    most = measurements.most
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
         star, before, joint = star_within(most), star_within(most), joint_within(most)
@@ -47,7 +46,7 @@ def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
             star, before = before, star
             n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, model, n, old)
-            write(out, joint, first, last, t, measurements.start[t], n)
+            write(out, joint.state, joint.scratch, first, last, t, measurements.start[t], n)
             old = n
     return out
 
@@ -95,7 +94,9 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
         store(joint.eta, i, subtract(vector_at(joint.eta, i), scale(gaps, row * central)))
         for j in range(i, n):
             other = count if j == e else -edge_to(star, joint, j + 1)[0]
-            add_at(joint, i * stride + j, central * row * other)
+            at, number = i * stride + j, central * row * other
+            block = add_diagonal(block_at(joint.information, at), (number, number, number))
+            store(joint.information, at, block)
 
 
 @inside
@@ -105,10 +106,3 @@ def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     edge = whole(polar)
     gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
     return edge, scale(gap, edge)
-
-
-@inside
-def add_at(joint: Joint, at: int, number: float) -> None:
-    """Add to the diagonal of a block."""
-    block = block_at(joint.information, at)
-    store(joint.information, at, add_diagonal(block, (number, number, number)))

@@ -54,6 +54,7 @@ class Measurements(NamedTuple):
         start: (T+1,) first link of each step.
         newest: (R, M) step of the newest message held, -1 for none.
         fresh: (R, M) whether it is new.
+        most: members of the largest star.
     """
 
     gnss: Floats
@@ -64,6 +65,7 @@ class Measurements(NamedTuple):
     start: Ints
     newest: Ints
     fresh: Bools
+    most: int
     ego: int
     dt: float
 
@@ -126,29 +128,25 @@ def block_at(memory: Any, index: Any) -> Any:
 @inside
 def moved_of(star: Star, k: int) -> Numbers:
     """Motion m of member k since the last step."""
-    row: Numbers = vector_at(star.motion, 4 * k + MOVED)
-    return row
+    return vector_at(star.motion, 4 * k + MOVED)
 
 
 @inside
 def process_of(star: Star, k: int) -> Numbers:
     """Its variance m^2."""
-    row: Numbers = vector_at(star.motion, 4 * k + PROCESS)
-    return row
+    return vector_at(star.motion, 4 * k + PROCESS)
 
 
 @inside
 def position_of(star: Star, k: int) -> Numbers:
     """Position m of member k, as broadcast and brought forward."""
-    row: Numbers = vector_at(star.motion, 4 * k + POSITION)
-    return row
+    return vector_at(star.motion, 4 * k + POSITION)
 
 
 @inside
 def variance_of(star: Star, k: int) -> Numbers:
     """Its variance m^2."""
-    row: Numbers = vector_at(star.motion, 4 * k + VARIANCE)
-    return row
+    return vector_at(star.motion, 4 * k + VARIANCE)
 
 
 @inside
@@ -184,15 +182,6 @@ def new_estimates(measurements: Measurements) -> Estimates:
 
 
 @inner
-def largest(start: Ints) -> int:
-    """Members of the largest star."""
-    most = 0
-    for t in range(len(start) - 1):
-        most = max(most, start[t + 1] - start[t])
-    return 1 + most
-
-
-@inner
 def gather(
     star: Star, before: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int
 ) -> int:
@@ -217,9 +206,10 @@ def gather(
             run = min(first + int(lane), last)
             receive(star, before, measurements, model, run, t, link, k, lane)
             if k > 0:
-                measured(star.relative, measurements.relative[run, link], model.relative_std, k, lane)
+                std = model.relative_std if len(model.relative_std) else UNIT
+                put_lane(star.relative, 8 * k, lane, with_std(measurements.relative[run, link], std))
         interpret(star, model, k, measurements.dt)
-    return int(n)
+    return n
 
 
 @inside
@@ -292,12 +282,6 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
     store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
     store(star.motion, 4 * k + POSITION, add(position_of(star, k), scale(moved, age)))
     store(star.motion, 4 * k + VARIANCE, add(variance_of(star, k), grown))
-
-
-@inside
-def measured(relative: Floats, measured: Floats, std: Floats, k: int, lane: int) -> None:
-    """Copy the measurement of member k, of `components`, with its standard deviations."""
-    put_lane(relative, 8 * k, lane, with_std(measured, std if len(std) else UNIT))
 
 
 @inside

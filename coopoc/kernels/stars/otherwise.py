@@ -92,7 +92,7 @@ from .gaussian import (
     Q,
     Rows,
     has,
-    shift,
+    stretch,
     widen,
 )
 
@@ -135,7 +135,7 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     for j in range(n):
         for c in range(2):
             g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
-    shift(g, i, i, keep - 1.0)
+    stretch(g, i, keep - 1.0)
     for c in range(3):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
 
@@ -147,13 +147,12 @@ def average(f: Filter, model: Model) -> None:
     `few` has a row for each number of the position and each error, and a column for each error: their covariances; the
     last two hold their means, and where they are in the state.
     """
-    g, few = f.g, f.few
-    first, n, where = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 1
+    g, few, n, where = f.g, f.few, 3, len(f.few[0]) - 1
     for c in range(3):
         f.ego[ADDED + c] = 0.0
-        few[c, where], f.ego[ANSWER + c] = first + c, g.x[first + c]
+        few[c, where], f.ego[ANSWER + c] = c, g.x[c]
         for d in range(3):
-            f.ego[COVARIANCE + 3 * c + d] = g.p[first + c, first + d]
+            f.ego[COVARIANCE + 3 * c + d] = g.p[c, d]
     for k in range(len(f.who) - 1, -1, -1):
         if f.who[k, VEHICLE] >= 0 and has(g, k, TURN):
             for c in range(3):
@@ -210,7 +209,7 @@ def clock_of(f: Filter, model: Model, k: int) -> float:
         return 0.0
     i = 3 * f.g.block[k, TURN] + 2
     m = f.g.x[i]
-    return float(m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2])))
+    return m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2]))
 
 
 @part
@@ -375,15 +374,15 @@ def slip(f: Filter, model: Model, own: Floats) -> None:
     s, by no more than fixes err and have shown."""
     if f.ego[NOW] == 0.0:
         return
-    rate, first = (model.slip * f.ego[SPEED_OF_LATE]) ** 2, 3 * f.g.block[0, PLACE]
+    rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
     variance = rate * own[DT] ** 2
     if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
         fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
         variance += min(rate * UNSEEN**2, fix + f.ego[SHOWN] ** 2)
-    widen(f.g, first, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
+    widen(f.g, 0, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
     for c in range(3):
         for d in range(3):
-            f.g.p[first + c, first + d] += variance * f.ego[COURSE + c] * f.ego[COURSE + d]
+            f.g.p[c, d] += variance * f.ego[COURSE + c] * f.ego[COURSE + d]
 
 
 @part
@@ -407,7 +406,7 @@ def surprised(f: Filter, fails: bool) -> bool:
     for fixes that jumped while odometry does not fail."""
     n = f.ego[NUMBERS]
     strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
-    return bool(strange and (f.ego[JUMPED] == 0.0 or fails))
+    return strange and (f.ego[JUMPED] == 0.0 or fails)
 
 
 @part
@@ -465,9 +464,7 @@ def corrected(f: Filter) -> None:
 @part
 def ego_variance(f: Filter) -> float:
     """m^2, of the three axes together."""
-    first = 3 * f.g.block[0, PLACE]
-    total: float = f.g.p[first, first] + f.g.p[first + 1, first + 1] + f.g.p[first + 2, first + 2]
-    return total
+    return f.g.p[0, 0] + f.g.p[1, 1] + f.g.p[2, 2]
 
 
 @part

@@ -9,6 +9,7 @@ and w makes the trace of P = (F + sum of L)^-1 least, F the information that dep
 convex function, by Newton's method within brackets from the weight of the step before. LANES runs side by side.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,9 @@ from ..compiling.small import (
     add,
     add_diagonal,
     apply,
+    choose_each,
     from_upper,
+    inner_product,
     inverse,
     load,
     minus_product,
@@ -27,7 +30,6 @@ from ..compiling.small import (
     scale,
     store,
     subtract,
-    times,
     transpose,
     zeros,
 )
@@ -35,15 +37,14 @@ from ..compiling.vectors import LANES, choose, take
 from ..gate import FIX_GATE, distance, gate_fix, inflation
 from ..geometry import Numbers, completed, direction, metres, spread, vector
 from .gated import gate_components, inflated
+from .joint_filter import write
 from .messages import (
     BLOCK,
     HELD,
     NEW,
     NONE,
     NOWHERE,
-    POSITION,
     RELATIVE,
-    VARIANCE,
     Assumptions,
     Estimates,
     Measurements,
@@ -51,7 +52,6 @@ from .messages import (
     block_at,
     clear,
     gather,
-    largest,
     moved_of,
     new_estimates,
     position_of,
@@ -74,7 +74,7 @@ class Fusion(NamedTuple):
     """The estimate of the ego and what is fused with it at a step.
 
     Attributes:
-        x: (3, LANES) m.
+        x: (3 most, LANES) m of the ego, and behind it its neighbours' own, NaN for none.
         dependent: (9 most, LANES) m^2 of each source, the ego's first.
         independent: (9 most, LANES) m^2.
         gap: (3 most, LANES) m, from the ego to their pseudo-fixes.
@@ -115,9 +115,9 @@ def run_intersection(
     """
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
-    most = largest(measurements.start)
+    most = measurements.most
     fusion = Fusion(
-        np.zeros((3, LANES)),
+        np.zeros((3 * most, LANES)),
         np.zeros((9 * most, LANES)),
         np.zeros((9 * most, LANES)),
         np.zeros((3 * most, LANES)),
@@ -136,7 +136,7 @@ def run_intersection(
             star, before = before, star
             n = gather(star, before, measurements, model, first, last, t, old)
             intersect(star, model, fusion, n, old)
-            write_ego(out, star, fusion.x, fusion.cov, first, last, t, measurements.start[t], n)
+            write(out, fusion.x, fusion.cov, first, last, t, measurements.start[t], n)
             old = n
     return out
 
@@ -188,7 +188,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
 def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
     """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
     o = 0.0 * x[0]
-    one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
+    one, nowhere = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0)), (o + math.nan, o + math.nan, o + math.nan)
     for k in range(1, n):
         gap = subtract(position_of(star, k), x)
         relative, variance = load(star.relative, k, RELATIVE), variance_of(star, k)
@@ -207,13 +207,15 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
             noise = cov_of(complete if fusion.naive else polar, relative, model.min_range)
         elif fusion.naive:
             theirs = scale(theirs, 0.0)
-        held = take(star.status, 5 * k + (NEW if fusion.naive else HELD))
+        known, held = o + NOWHERE - variance[0], take(star.status, 5 * k + HELD)
+        store(fusion.x, k, choose_each(choose(known, held, o), position_of(star, k), nowhere))
+        held = take(star.status, 5 * k + NEW) if fusion.naive else held
         gap = subtract(gap, vector(complete))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
         f = choose(counts, f, o + 1.0)
-        store(fusion.used, k, (choose(o + NOWHERE - variance[0], counts, o),))
+        store(fusion.used, k, (choose(known, counts, o),))
         store(fusion.gap, k, gap)
         add_source(fusion, k, scale(theirs, f), scale(noise, f))
 
@@ -221,15 +223,13 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
 @inside
 def trace(a: Numbers) -> float:
     """Of a 3 x 3 matrix."""
-    diagonal: float = a[0] + a[4] + a[8]
-    return diagonal
+    return a[0] + a[4] + a[8]
 
 
 @inside
 def own_cov(fusion: Fusion) -> Numbers:
     """Covariance m^2 of the ego's prediction."""
-    cov: Numbers = add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
-    return cov
+    return add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
 
 
 @inside
@@ -275,8 +275,7 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    best: float = choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
-    return best
+    return choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
 
 
 @inner
@@ -296,16 +295,7 @@ def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float
 @inside
 def product(a: Numbers, b: Numbers) -> Numbers:
     """A B."""
-    result: Numbers = negate(minus_product(a, b))
-    return result
-
-
-@inside
-def inner_product(a: Numbers, b: Numbers) -> float:
-    """The sum of a_i b_i."""
-    p = times(a, b)
-    total: float = p[0] + p[1] + p[2] + p[3] + p[4] + p[5] + p[6] + p[7] + p[8]
-    return total
+    return negate(minus_product(a, b))
 
 
 @inside
@@ -315,26 +305,3 @@ def cov_of(polar: Numbers, measured: Numbers, least: float) -> Numbers:
     std = -max(-measured[5], -1e3), -max(-measured[6], -1e3), -max(-measured[7], -1e3)
     a, b, c = metres(polar, std, least)
     return spread(polar, a * a, b * b, c * c)
-
-
-@inner
-def write_ego(
-    out: Estimates,
-    star: Star,
-    x: Floats,
-    cov: Floats,
-    first: int,
-    last: int,
-    t: int,
-    link: int,
-    n: int,
-) -> None:
-    """Copy the ego's estimate in runs first to last, and its neighbours' own ones, NaN where none is held."""
-    for lane in range(last - first + 1):
-        for i in range(3):
-            out[0][first + lane, t, i] = x[i, lane]
-            for j in range(3):
-                out[1][first + lane, t, i, j] = cov[3 * i + j, lane]
-            for k in range(1, n):
-                held = star.status[5 * k + HELD, lane] > 0.0 and star.motion[12 * k + 3 * VARIANCE + i, lane] < NOWHERE
-                out[2][first + lane, link + k - 1, i] = star.motion[12 * k + 3 * POSITION + i, lane] if held else np.nan

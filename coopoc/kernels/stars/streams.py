@@ -17,6 +17,7 @@ from .cooperative_messages import remember
 from .cooperative_state import (
     AGE,
     ANSWER,
+    AT,
     BY_FIXES,
     DT,
     EXTRA_VARIANCE,
@@ -31,7 +32,6 @@ from .cooperative_state import (
     STEP,
     STEPS,
     TYPICAL,
-    WAY,
     Filter,
     Model,
     begin,
@@ -39,7 +39,6 @@ from .cooperative_state import (
     is_placed,
     new_filter,
 )
-from .gaussian import PLACE
 from .otherwise import DOUBTS, Tries, measured_motion, new_tries
 
 
@@ -102,7 +101,7 @@ def stream_rows(
         process_variance(motion, newest[STEP:TYPICAL], newest[SPEED:STEP], interval, row[STEP:TYPICAL])
         for c in range(3):
             row[STEP + c], row[TYPICAL + c] = row[STEP + c] * (dt / interval) ** 2, fix[c]
-    return int(outcome)
+    return outcome
 
 
 @compiled
@@ -142,7 +141,7 @@ def stream_step(
     for i in range(len(vehicles)):
         k = f.slot[vehicles[i]]
         for c in range(3):
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c] if k >= 0 else math.nan
+            answer[12 + 3 * i + c] = f.member[k, AT + c] if k >= 0 else math.nan
     return True
 
 

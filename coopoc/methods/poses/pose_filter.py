@@ -26,7 +26,6 @@ from .pose_inputs import (
     SPREAD,
     UPLOAD,
     body_of,
-    check_spread,
     first_poses,
     fleet_members,
     pose_measurements,
@@ -103,7 +102,8 @@ class PoseFilter:
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
-        check_spread(self.spread)
+        if not (checked("spread", self.spread, "(4,)", (4,)) > 0).all():
+            raise InputError("spread", self.spread, "must be > 0", "Give m, m, m and rad.")
         if not self.name:
             self.__dict__["name"] = f"pose-{self.unit if self.fusion == 'joint' else self.fusion}"
 

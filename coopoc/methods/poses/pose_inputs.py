@@ -51,12 +51,6 @@ def to_landmarks(recording: Recording, links: Ints) -> Ints:
     return links[np.isin(recording.links.neighbour[links], recording.landmarks)]
 
 
-def check_spread(spread: Sequence[float]) -> None:
-    """InputError unless four numbers > 0."""
-    if not (checked("spread", spread, "(4,)", (4,)) > 0).all():
-        raise InputError("spread", spread, "must be > 0", "Give m, m, m and rad.")
-
-
 def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[int]) -> Floats:
     """Poses (R, N, 4) m and rad at the first step that were given, NaN where a fix and a compass take their place.
 
@@ -136,7 +130,7 @@ def pose_measurements(
         np.ascontiguousarray(present(recording)[:, members]),
         np.stack([number[table.observer[links]], number[table.neighbour[links]]], axis=1),
         np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),
-        np.ascontiguousarray(recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark),
+        recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark,
         np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),
         recording.dt,
     )

@@ -26,17 +26,18 @@ def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> 
     """Poses (R, N, 4) of some vehicles at the first step, as `pose_start` says, by a solo PoseFilter."""
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
+        one = recording.of_runs(slice(run, run + 1))
         positions = np.full((len(recording.t), len(recording.ids), 3), np.nan)
-        positions[:, list(recording.landmarks)] = recording.gnss[run][:, list(recording.landmarks)]
+        positions[:, list(recording.landmarks)] = one.gnss[0][:, list(recording.landmarks)]
         waiting = list(members)
         while waiting:
-            column, links = _next(recording, run, waiting, positions)
-            begin[run, column], positions[:, column] = _most_likely(recording, run, column, links, positions, filter_)
+            column, links = _next(one, waiting, positions)
+            begin[run, column], positions[:, column] = _most_likely(one, column, links, positions, filter_)
             waiting.remove(column)
     return begin
 
 
-def _next(recording: Recording, run: int, waiting: list[int], places: Floats) -> tuple[int, Ints]:
+def _next(recording: Recording, waiting: list[int], places: Floats) -> tuple[int, Ints]:
     """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix, sees
     two of them or has bearings of AIMED; else, of the one with most, those to all whose `places` (T, N, 3) m are
     finite."""
@@ -44,41 +45,40 @@ def _next(recording: Recording, run: int, waiting: list[int], places: Floats) ->
     for column in waiting:
         links = recording.links.of(column)
         marks = to_landmarks(recording, links)
-        there = np.isfinite(recording.relative[run, marks])
+        there = np.isfinite(recording.relative[0, marks])
         whole, aimed = (
             len(np.unique(recording.links.neighbour[marks[each]])) for each in (there[:, :2].all(axis=1), there[:, 1])
         )
-        fix = np.isfinite(recording.gnss[run, :, column, 0]).any()
+        fix = np.isfinite(recording.gnss[0, :, column, 0]).any()
         if fix or whole > 1 or aimed >= AIMED:
             return column, marks
         every.append(links[np.isfinite(places[recording.links.step[links], recording.links.neighbour[links], 0])])
-    most = int(np.argmax([np.isfinite(recording.relative[run, links, :2]).all(axis=1).sum() for links in every]))
+    most = int(np.argmax([np.isfinite(recording.relative[0, links, :2]).all(axis=1).sum() for links in every]))
     return waiting[most], every[most]
 
 
-def _most_likely(
-    recording: Recording, run: int, column: int, links: Ints, places: Floats, filter_: Any
-) -> tuple[Floats, Floats]:
+def _most_likely(recording: Recording, column: int, links: Ints, places: Floats, filter_: Any) -> tuple[Floats, Floats]:
     """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood: of
     headings around the circle, then around the best of them."""
     landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
     noise, angles = recording.sensors, STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
-        apart, ranges = np.linalg.norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[run, links, 0]
+        apart, ranges = np.linalg.norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[0, links, 0]
         filter_ = replace(filter_, assumed=_of_vehicles(noise, np.where(np.isnan(ranges), apart, ranges)))
 
     def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats, Floats]:
         """States (H, T, d), their covariances, and costs (H,), from poses (H, 4) whose headings err by that."""
         tried = np.full((len(poses), len(recording.ids), 4), np.nan)
         tried[:, column] = poses
-        own = replace(filter_, spread=(*_spread(noise), turn))
-        copies = recording.of_runs(np.full(len(poses), run))
+        spread = [2 * max(std, noise.range_std) for std in noise.fix_std]  # of one fix or one landmark, m
+        own = replace(filter_, spread=(*spread, turn))
+        copies = recording.of_runs(np.zeros(len(poses), int))
         x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
-        return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise)
+        return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, column, poses[:, 3], noise)
 
-    bare = np.isnan(recording.gnss[run, :, column, 0]).all() and np.isnan(recording.relative[run, links, 0]).all()
+    bare = np.isnan(recording.gnss[0, :, column, 0]).all() and np.isnan(recording.relative[0, links, 0]).all()
     for turn in (STEP / 2, 2 * STEP / HEADINGS):
-        poses = _hypotheses(recording, run, column, links, landmarks, angles)
+        poses = _hypotheses(recording, column, links, landmarks, angles)
         costs = filtered(poses, turn)[2]
         best = poses[[np.argmin(costs)]]
         apart = np.abs(wrap(poses[:, 3] - best[0, 3])) > ELSEWHERE
@@ -86,38 +86,34 @@ def _most_likely(
             raise _too_little(recording, column)
         angles = best[0, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
     (x,), (cov,), _ = filtered(best, STEP / 2)
-    return _back(recording, run, column, x, cov), x[:, :3]
+    return _back(recording, column, x, cov), x[:, :3]
 
 
-def _back(recording: Recording, run: int, column: int, x: Floats, cov: Floats) -> Floats:
+def _back(recording: Recording, column: int, x: Floats, cov: Floats) -> Floats:
     """Pose (4,) at the first step: its heading, and then its place, from the state of x (T, d), of covariance
     (T, d, d), from which odometry, less the errors that the filter has found of it, leads back most surely."""
     count = int(np.argmin(np.isfinite(x[:, 0]))) or len(x)  # before it is absent
     scale, bias = x[count - 1, 4:6] if x.shape[1] > 4 else (0.0, 0.0)
-    turns, way = _reckoned(recording, run, column, scale, bias)
+    turns, way = _reckoned(recording, column, scale, bias)
     noise, since = recording.sensors, recording.dt * recording.dt * np.arange(count)
     white = noise.yaw_rate_std**2 * since
     sure = cov[:count, 3, 3] + white
     best = int(np.argmin(sure))
     heading = x[best, 3] - turns[best]
-    drift = np.square(noise.velocity_std(recording.velocity[run, :count, column, :2], noise.velocity_floor)).sum(
-        axis=-1
-    )
+    drift = np.square(noise.velocity_std(recording.velocity[0, :count, column, :2], noise.velocity_floor)).sum(axis=-1)
     off = np.trace(cov[:count, :2, :2], axis1=1, axis2=2) + recording.dt**2 * np.cumsum(drift)
     off += np.square(way[:count]).sum(axis=1) * (sure[best] + white / 3.0)
     near = int(np.argmin(off))
     return np.append(x[near, :3] - turned(way[near], heading), heading)
 
 
-def _reckoned(
-    recording: Recording, run: int, column: int, scale: float = 0.0, bias: float = 0.0
-) -> tuple[Floats, Floats]:
+def _reckoned(recording: Recording, column: int, scale: float = 0.0, bias: float = 0.0) -> tuple[Floats, Floats]:
     """How far a vehicle has turned (T,) rad and moved (T, 3) m in its first body frame, by its odometry less a scale
     error and a bias of yaw rates, rad/s."""
-    dt, rate = recording.dt, body_of(recording).yaw_rate[run, :, column] - bias
+    dt, rate = recording.dt, body_of(recording).yaw_rate[0, :, column] - bias
     rate[0] = 0.0
     turns = np.cumsum(dt * rate)
-    moved = turned(dt / (1.0 + scale) * recording.velocity[run, :, column], turns - 0.5 * dt * rate)
+    moved = turned(dt / (1.0 + scale) * recording.velocity[0, :, column], turns - 0.5 * dt * rate)
     moved[0] = 0.0
     return turns, np.cumsum(moved, axis=0)
 
@@ -133,20 +129,14 @@ def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
     )
 
 
-def _spread(sensors: Sensors) -> tuple[float, float, float]:
-    """Of a position from one fix or one landmark, whichever is worse, m."""
-    x, y, z = (max(std, sensors.range_std) for std in sensors.fix_std)
-    return 2 * x, 2 * y, 2 * z
-
-
-def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Floats, noise: Sensors) -> Floats:
+def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: Sensors) -> Floats:
     """(hypotheses,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
     links = recording.links.of(column)
     links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
     step, other = recording.links.step[links], recording.links.neighbour[links]
-    gap = recording.gnss[run, step, other] - recording.gnss[run, step, column]
-    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _reckoned(recording, run, column)[0][step]
-    residual = wrap(recording.relative[run, links, 1] + angles[:, None] - azimuth)
+    gap = recording.gnss[0, step, other] - recording.gnss[0, step, column]
+    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _reckoned(recording, column)[0][step]
+    residual = wrap(recording.relative[0, links, 1] + angles[:, None] - azimuth)
     fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
     cost: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
     return cost
@@ -157,27 +147,27 @@ AIMED, SHARP, WINDOW = 4, 0.1, 5.0
 beside a line, below which ranges leave the side open; and s for which measurements count once all were seen."""
 
 
-def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
+def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
     """(hypotheses, 4) poses at the first step that the first fix, or what is seen first in SEEN places, leaves for each
     heading, with `places` (L, 3) m of what the links measure."""
-    body, relative = body_of(recording), recording.relative[run, links]
-    fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
+    body, relative = body_of(recording), recording.relative[0, links]
+    fixes = np.flatnonzero(np.isfinite(recording.gnss[0, :, column, 0]))
     complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
-    turns, way = _reckoned(recording, run, column)
-    compass = body.heading[run, 0, column]
+    turns, way = _reckoned(recording, column)
+    compass = body.heading[0, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
-        return _of_parts(recording, run, column, links, places, angles, (turns, way))
+        return _of_parts(recording, column, links, places, angles, (turns, way))
     if (
         not len(fixes)
-        and np.isnan(body.heading[run, :, column]).all()
+        and np.isnan(body.heading[0, :, column]).all()
         and (places[complete] == places[complete[0]]).all()
     ):
         actual = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
         raise InputError("seconds", actual, "must hold a second place", "Take more seconds, or give its pose.")
     if len(fixes):
         step = fixes[:1]
-        at, offset = recording.gnss[run, step, column], way[step]
+        at, offset = recording.gnss[0, step, column], way[step]
     else:
         first = complete[np.sort(np.unique(places[complete], axis=0, return_index=True)[1])[:SEEN]]
         step, at = recording.links.step[links[first]], places[first]
@@ -189,7 +179,6 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
 
 def _of_parts(
     recording: Recording,
-    run: int,
     column: int,
     links: Ints,
     places: Floats,
@@ -197,7 +186,7 @@ def _of_parts(
     odometry: tuple[Floats, ...],
 ) -> Floats:
     """(hypotheses, 4) poses that ranges alone, or bearings of landmarks alone, leave for each heading."""
-    (turns, way), relative = odometry, recording.relative[run, links]
+    (turns, way), relative = odometry, recording.relative[0, links]
     standing = np.isin(recording.links.neighbour[links], recording.landmarks)
     ranged, aimed = (np.flatnonzero(np.isfinite(relative[:, k]) & (standing | (k == 0))) for k in (0, 1))
     for rows, is_range in ((ranged, True), (aimed, False)):
