@@ -90,7 +90,7 @@ def read_tum(path: Path, **options: Any) -> Fleet:
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
     poses = [tum.read_tum(file) for file in files]
-    ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in range(len(track))]
+    ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in track.stamps]
     t, x = (np.concatenate([getattr(track, field) for track in poses]) for field in ("stamps", "position"))
     source = f"TUM {path.name}, velocity by backward difference"
     return assemble(ids, t, x, **options, file=path.name, name=path.stem, source=source)
