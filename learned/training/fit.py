@@ -15,11 +15,12 @@ from coopoc.arrays import Floats, Ints, check_fields, instance
 from coopoc.short_repr import short_repr
 from coopoc.world.sensors import stream
 
+from ..engine.optimiser import Moments, Update
 from ..nets.gain import Gain
 from ..nets.stack import flatten, unflatten
 from .clients import Batch, Segments, mirrored
 from .machine import one_core, watched
-from .schedule import Moving, Schedule, cosine, generator
+from .schedule import Schedule, cosine, generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,8 @@ def descend(
     A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
     models with shorter plans wait for the longest. Their loss is NaN.
     """
-    moving = Moving(theta, torch.zeros_like(theta), torch.zeros_like(theta))
+    weights = theta.numpy()
+    moments = Moments(weights, np.zeros_like(weights), np.zeros_like(weights))
     for step in range(max(map(len, plans))):
         rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
         losses = np.full(len(plans), math.nan, np.float32)
@@ -167,10 +169,12 @@ def descend(
             batch = pool.batch(torch.from_numpy(np.array([plans[r][step] for r in rows])))
             batch = mirrored(batch, dice) if schedule.mirror else batch
             rate = np.array([rates[r][step] for r in rows])
-            losses[rows], taken = like.descend(moving, np.array(rows), batch, step + 1, rate, schedule)
+            update = Update(np.array(rows), step + 1, rate, schedule.weight_decay, schedule.clip)
+            outcome = like.descend(moments, batch, update)
+            losses[rows] = outcome.losses
             stopped |= {
                 r: f"loss or gradient not finite at step {step + 1}"
-                for r, good in zip(rows, taken.tolist(), strict=True)
+                for r, good in zip(rows, outcome.finite, strict=True)
                 if not good
             }
         yield step + 1, torch.from_numpy(losses)
