@@ -133,7 +133,6 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     """
     path, net = given_path(path), instance("net", net, str, 'Give "mine.py:Net".')
     tensors, card = read(path)
-    history = tensors.pop(_HISTORY, None)
     if not isinstance(card.get("kind"), str) or not isinstance(card.get("net"), dict):
         kind_and_net = {name: card.get(name) for name in ("kind", "net")}
         allowed = "must name a kind of net and its settings"
@@ -147,17 +146,21 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
         model: Gain = made(**card["net"])
     except TypeError as error:
         raise InputError(f"checkpoint {path}: net", card["net"], f"does not fit ({error})", "Train it again.") from None
-    load_into(model, tensors, path)
-    if history is not None:
-        count = sum(p.numel() for p in model.parameters())
-        _match(path, {_HISTORY: (*history.shape[:1], count)}, {_HISTORY: history})
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    expected = {name: tuple(p.shape) for name, p in model.named_parameters()}
+    if _HISTORY in tensors:
+        expected[_HISTORY] = (*shapes[_HISTORY][:1], sum(p.numel() for p in model.parameters()))
+    for name in sorted(expected.keys() | shapes.keys()):
+        if expected.get(name) != shapes.get(name):
+            raise InputError(
+                f"checkpoint {path}",
+                f"{name} of shape {shapes.get(name, 'missing')}",
+                f"expected {expected.get(name, 'no such tensor')}",
+                "Use a net of its card's settings.",
+            )
+    history = tensors.pop(_HISTORY, None)
+    model.load_state_dict(tensors)
     return Checkpoint(model, card, history)
-
-
-def load_into(model: Gain, tensors: Mapping[str, Tensor], path: Path | str = "checkpoint") -> None:
-    """Put named tensors into a net; InputError naming the expected and the given shape if they do not fit."""
-    _match(path, {name: tuple(p.shape) for name, p in model.named_parameters()}, tensors)
-    model.load_state_dict(dict(tensors))
 
 
 def read_card(path: Path | str) -> Mapping[str, Any]:
@@ -211,15 +214,3 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         )
         warnings.warn(text, RuntimeWarning, stacklevel=3)
     return content
-
-
-def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor]) -> None:
-    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    for name in sorted(expected.keys() | shapes.keys()):
-        if expected.get(name) != shapes.get(name):
-            raise InputError(
-                f"checkpoint {path}",
-                f"{name} of shape {shapes.get(name, 'missing')}",
-                f"expected {expected.get(name, 'no such tensor')}",
-                "Use a net of its card's settings.",
-            )
