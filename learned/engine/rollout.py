@@ -92,10 +92,10 @@ def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity:
         if array.shape != shape:
             raise InputError(name, f"shape {tuple(array.shape)}", f"must be {shape}", "See rollout.")
     fixes, speeds, start = _array(gnss, theta.dtype), _array(velocity, theta.dtype), _array(x0, theta.dtype)
-    spans = np.full(steps, dt, fixes.dtype) if isinstance(dt, float) else np.asarray(dt, dtype=fixes.dtype)
+    spans = np.asarray(dt, fixes.dtype)
     if spans.shape not in ((), (steps,)):
         raise InputError("dt", f"shape {spans.shape}", f"must be one number or ({steps},)", "Give s per step.")
-    return Drives(fixes, speeds, start, np.broadcast_to(spans, steps).copy() if spans.ndim == 0 else spans)
+    return Drives(fixes, speeds, start, np.broadcast_to(spans, steps).copy())
 
 
 def _array(tensor: Tensor, dtype: torch.dtype) -> AnyArray:
