@@ -18,7 +18,6 @@ from coopoc.file_names import given_path
 
 from ..checkpoint import Checkpoint, read_card, save
 from ..federation.combine import SERVER, screen, too_few
-from ..federation.federate import Plan
 from ..federation.history import Federation, Round
 from ..federation.rules import rule
 from ..nets.gain import Gain
@@ -144,7 +143,7 @@ def rounds(
 
     (theta,) = flatten([untrained(job)])
     one_of("aggregate", job.recipe.aggregate, tuple(STRATEGIES))
-    Plan(aggregate=job.recipe.aggregate).check(nodes)
+    job.recipe.plan.check(nodes)
     named = {} if names is None else names
     strategy, until = _strategy(job.recipe.aggregate, theta, keep, named), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:
@@ -294,8 +293,7 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
                 row.note,
             )
         )
-    made = Federation(untrained(job), tuple(history), tuple(sizes[name] for name in names), seconds, tuple(names))
-    return replace(made, model=made.after(made.best.number))
+    return Federation(untrained(job), tuple(history), tuple(sizes[name] for name in names), seconds, tuple(names))
 
 
 def checkpoint(rows: Sequence[Row], job: Job, seconds: float) -> Checkpoint:
