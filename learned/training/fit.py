@@ -72,7 +72,7 @@ def fit(
     model: Gain,
     training: Segments,
     validation: Segments,
-    schedule: Schedule | None = None,
+    schedule: Schedule = Schedule(),
     seed: int = 0,
     progress: str | None = None,
     long: Segments | None = None,
@@ -102,13 +102,13 @@ def fit(
 
 
 @one_core()
-def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: str | None = None) -> list[Fit]:
+def fit_many(tasks: Sequence[Task], schedule: Schedule = Schedule(), progress: str | None = None) -> list[Fit]:
     """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding.
 
     Raises:
         InputError: some of the tasks have long pieces and some have none.
     """
-    schedule = Schedule() if schedule is None else instance("schedule", schedule, Schedule)
+    instance("schedule", schedule, Schedule)
     began = time.perf_counter()
     like, theta = tasks[0].model, flatten([t.model for t in tasks])
     pool, members = pooled([t.training for t in tasks])
