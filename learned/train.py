@@ -139,8 +139,7 @@ def _drives(segments: Segments) -> tuple[Recording, Fleet]:
     truth = np.where(np.isnan(truth).all(axis=(0, 1)), 0.0, truth)
     names = tuple(map(str, range(gnss.shape[1])))
     fleet = Fleet(names, segments.dt * np.arange(len(gnss)), truth, 0 * truth)
-    still = replace(fleet, position=np.zeros_like(truth), velocity=np.zeros_like(truth))
-    recording = observe(still, Sensors(), V2X(max_neighbours=0))
+    recording = observe(fleet, Sensors(), V2X(max_neighbours=0))
     return replace(recording, gnss=gnss[None], velocity=velocity[None]), fleet
 
 
