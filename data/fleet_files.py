@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from coopoc import Fleet, InputError
-from coopoc.escapes import spreadsheet
 from coopoc.formats import trajectories as tum
+from coopoc.text import spreadsheet
 
 from .assemble import assemble
 from .cells import factors, named_columns, numeric, read_frame, seconds, words

@@ -17,11 +17,9 @@ from torch import Tensor
 
 from coopoc.arrays import check_fields, instance, named
 from coopoc.errors import InputError, shown
-from coopoc.file_names import given_path, replaceable
 from coopoc.formats.seals import UNSEALED, holds, sealed
-from coopoc.one_file import in_file, path_of
-from coopoc.plugins import find, points
-from coopoc.short_repr import short_repr
+from coopoc.plugins import find, in_file, path_of, points
+from coopoc.text import given_path, replaceable, short_repr
 
 from .nets.gain import Gain
 from .nets.stack import unflatten

@@ -14,7 +14,7 @@ from coopoc.methods.doubts import doubts
 from coopoc.methods.gaps import in_stretches
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Alone, Track, silent_track
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
 from .stream import GainState, SoloGain, StepByStep

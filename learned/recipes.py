@@ -11,9 +11,8 @@ import torch
 from coopoc import InputError, Method, Outliers, Sensors
 from coopoc.arrays import check_fields, instance, one_of
 from coopoc.errors import unknown
-from coopoc.file_names import given_path
-from coopoc.one_file import file_digest, in_file
-from coopoc.plugins import find
+from coopoc.plugins import file_digest, find, in_file
+from coopoc.text import given_path
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import load

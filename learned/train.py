@@ -15,8 +15,8 @@ import torch
 
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import listed, number
-from coopoc.file_names import given_path
-from coopoc.one_file import in_file
+from coopoc.plugins import in_file
+from coopoc.text import given_path
 from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import AnyArray, Bools, Floats, Ints, frozen
 from ..errors import InputError
-from ..short_repr import short_repr
+from ..text import short_repr
 from .values import LEAST, UNIT, to_rotation
 
 ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, checked
 from ..errors import InputError
-from ..file_names import given_path
+from ..text import given_path
 from .values import UNIT, read_table, to_orientation, to_rotation
 
 

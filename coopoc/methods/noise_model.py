@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Floats, Ints, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
-from ..short_repr import short_repr
+from ..text import short_repr
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
 from ..world.links import vector_cov

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, texts
 from ..errors import InputError
-from ..short_repr import short_repr
+from ..text import short_repr
 from .fleet import clock, columns, interval, names
 from .links import Links, drop_steep_azimuths, stretches
 from .plausible import FARTHEST, FASTEST, FASTEST_TURN, headings, plausible, radians

@@ -13,7 +13,7 @@ from torch import Tensor
 from coopoc import InputError, Ledger
 from coopoc.arrays import instance
 from coopoc.evaluate.ledger import of_training
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 
 from ..nets.gain import Gain
 from ..nets.stack import unflatten

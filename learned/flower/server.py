@@ -13,8 +13,7 @@ from torch import Tensor
 
 from coopoc import InputError, arrays
 from coopoc.arrays import one_of
-from coopoc.escapes import visible
-from coopoc.file_names import given_path
+from coopoc.text import given_path, visible
 
 from ..checkpoint import Checkpoint, read_card, save
 from ..federation.combine import SERVER, screen, too_few

@@ -12,7 +12,7 @@ from torch import Tensor
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.arrays import AnyArray, Floats, check_fields, instance, number, one_of
 from coopoc.errors import shown
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 Start = Literal["gnss", "true"]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from coopoc import InputError
 from coopoc.arrays import Floats, Ints, check_fields, instance
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 from ..engine.optimiser import Moments, Update
