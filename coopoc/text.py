@@ -57,12 +57,11 @@ def file_name(field: str, name: object, hint: str) -> str:
         device = name.partition(".")[0].strip().upper() in _DEVICES
         if not device and name == name.strip(" .") and len(name.encode()) <= _LONGEST:
             return name
-    shown_name = repr(name) if len(repr(name)) < 60 else f"{repr(name)[:60]}..."
     allowed = (
         f'must be a file name: at most {_LONGEST} bytes, printable, without < > : " / \\ | ? *, '
         "no dot or space at its ends, and no device of Windows such as CON"
     )
-    raise InputError(field, shown_name, allowed, hint)
+    raise InputError(field, shown(name), allowed, hint)
 
 
 def replaceable(path: Path) -> Path:

@@ -182,15 +182,14 @@ def _opened(path: Path) -> Any:
 
 
 def _card(file: Any, path: Path | str) -> dict[str, Any]:
-    text = (file.metadata() or {}).get("card")
-    if text is None:
-        raise InputError("checkpoint", path, "must carry a card in its metadata", "Write it with checkpoint.save.")
     try:
-        card: Any = json.loads(text)
+        card: Any = json.loads((file.metadata() or {}).get("card", "null"))
     except (ValueError, RecursionError) as error:
         raise InputError("checkpoint", path, f"has a damaged card ({error})", "Train it again.") from None
     if not isinstance(card, dict):
-        raise InputError("checkpoint", path, "must have a card of named fields", "Write it with checkpoint.save.")
+        raise InputError(
+            "checkpoint", path, "must carry a card of named fields in its metadata", "Write it with checkpoint.save."
+        )
     return card
 
 

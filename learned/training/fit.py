@@ -3,8 +3,8 @@
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -53,14 +53,19 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A trained net: the weights that validated best, how it went, why it stopped early (None: it did not), seconds."""
+    """A trained net: a net of its shape, how it went, why it stopped early (None: it did not), seconds."""
 
-    model: Gain
+    like: Gain
     history: tuple[Progress, ...]
     stopped: str | None
     seconds: float
 
     __repr__ = short_repr
+
+    @cached_property
+    def model(self) -> Gain:
+        """The net with the weights that validated best."""
+        return unflatten(self.best.weights[None], self.like)[0]
 
     @property
     def best(self) -> Progress:
@@ -119,8 +124,7 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule = Schedule(), progress: s
         actual = f"with {len(long)} of {len(tasks)} tasks"
         raise InputError("long", actual, "must be given with all tasks or with none", "Train them apart.")
     judge = Judge([[t.validation for t in tasks], *([long] if long else [])], like)
-    best, lowest = theta.clone(), judge(theta)
-    history = [[Progress(0, w.clone(), math.nan, float(low))] for w, low in zip(theta, lowest, strict=True)]
+    history = [[Progress(0, w.clone(), math.nan, float(loss))] for w, loss in zip(theta, judge(theta), strict=True)]
     stopped: dict[int, str] = {}
     so_far: list[Tensor] = []
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
@@ -135,13 +139,10 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule = Schedule(), progress: s
             for row in checked:
                 mean = torch.stack([one[row] for one in so_far[history[row][-1].step :]]).mean()
                 history[row].append(Progress(step, theta[row].clone(), float(mean), float(validated[row])))
-                if validated[row] < lowest[row]:
-                    best[row], lowest[row] = theta[row], validated[row]
-    for row in torch.nonzero(lowest.isinf()).flatten().tolist():
-        stopped.setdefault(row, "no weights had a finite validation loss; start from GainNet(start_gain=0.1)")
     seconds = (time.perf_counter() - began) / len(tasks)
-    models = unflatten(best, like)
-    return [Fit(m, tuple(h), stopped.get(i), seconds) for i, (m, h) in enumerate(zip(models, history, strict=True))]
+    fits = [Fit(like, tuple(rows), stopped.get(i), seconds) for i, rows in enumerate(history)]
+    reason = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
+    return [fit if fit.stopped or fit.best.validation_loss < math.inf else replace(fit, stopped=reason) for fit in fits]
 
 
 def descend(
