@@ -12,6 +12,9 @@ from .evaluate.metrics import max_error as max_error
 from .evaluate.metrics import nees as nees
 from .evaluate.metrics import pose_nees as pose_nees
 from .evaluate.metrics import rt_le as rt_le
+from .evaluate.pictures import plot_recording as plot_recording
+from .evaluate.pictures import plot_solution as plot_solution
+from .evaluate.pictures import plot_track as plot_track
 from .evaluate.statistics import paired_difference as paired_difference
 from .fleets import fetch as fetch
 from .fleets import load_fleet as load_fleet
@@ -46,9 +49,6 @@ from .optimize.model.problem import Problem as Problem
 from .optimize.model.space import pose as pose
 from .optimize.solution import Solution as Solution
 from .optimize.solve import solve as solve
-from .plots import plot_recording as plot_recording
-from .plots import plot_solution as plot_solution
-from .plots import plot_track as plot_track
 from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study

@@ -246,19 +246,6 @@ def texts(field: str, values: object) -> tuple[str, ...]:
     return tuple(values_listed)
 
 
-def check_texts(owner: object, *fields: str) -> None:
-    """InputError for the first of these attributes that is no text.
-
-    >>> from types import SimpleNamespace
-    >>> check_texts(SimpleNamespace(name=3), "name")
-    Traceback (most recent call last):
-    coopoc.errors.InputError: name = 3: must be text. Leave it out, or give a word.
-    """
-    for field in fields:
-        if not isinstance(value := getattr(owner, field), str):
-            raise InputError(field, shown(value), "must be text", "Leave it out, or give a word.")
-
-
 def check_fields(made: Any, limits: Limits | None = None) -> None:
     """InputError for a value of another type than its field of a dataclass has; NumPy's numbers become Python's.
 

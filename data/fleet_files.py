@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from coopoc import Fleet, InputError
-from coopoc.escapes import spreadsheet
 from coopoc.formats import trajectories as tum
+from coopoc.text import spreadsheet
 
 from .assemble import assemble
 from .cells import factors, named_columns, numeric, read_frame, seconds, words
@@ -89,7 +89,7 @@ def read_tum(path: Path, **options: Any) -> Fleet:
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
     poses = [tum.read_tum(file) for file in files]
-    ids = np.repeat([file.stem for file in files], [len(track) for track in poses]).tolist()
+    ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in track.stamps]
     t, x = (np.concatenate([getattr(track, field) for track in poses]) for field in ("stamps", "position"))
     source = f"TUM {path.name}, velocity by backward difference"
     return assemble(ids, t, x, **options, file=path.name, name=path.stem, source=source)

@@ -10,9 +10,8 @@ import scipy
 
 from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
-from coopoc.file_names import given_path
 from coopoc.formats.values import LARGEST, read_table, read_words
-from coopoc.short_repr import short_repr
+from coopoc.text import given_path, short_repr
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
 

@@ -10,9 +10,8 @@ from typing import Any
 
 from coopoc import Fleet, InputError
 from coopoc.errors import suggestion, unknown
-from coopoc.file_names import given_path
-from coopoc.one_file import in_file
-from coopoc.plugins import find, names
+from coopoc.plugins import find, in_file, names
+from coopoc.text import given_path
 from coopoc.world.storage import read_recording
 
 from .cells import TABLES

@@ -12,9 +12,8 @@ import numpy as np
 
 from coopoc import Fleet, InputError, Recording
 from coopoc.errors import suggestion
-from coopoc.file_names import given_path
-from coopoc.one_file import in_file
-from coopoc.plugins import names
+from coopoc.plugins import in_file, names
+from coopoc.text import given_path
 
 from .fetch import bring, local
 

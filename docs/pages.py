@@ -35,7 +35,7 @@ SECTIONS = {
     "world": ("Worlds and measurements", "Fleets, sensors, V2X, recordings."),
     "methods": ("Methods", "Recording → Track."),
     "optimize": ("Problems and solvers", "Problems, factors, `solve`."),
-    "evaluate": ("Evaluation", "Metrics, bounds, statistics."),
+    "evaluate": ("Evaluation", "Metrics, bounds, statistics, pictures."),
     "study": ("Studies", "Grids of cells, results, views."),
     "fleets": ("Files", "Drives, graphs and logs from files."),
     "formats": ("Trajectory files", "Estimates for other programs."),

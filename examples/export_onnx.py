@@ -20,9 +20,9 @@ from torch import Tensor, nn
 
 from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
-from coopoc.file_names import given_path, replaceable
 from coopoc.learned.checkpoint import Checkpoint, load
 from coopoc.learned.nets.gain_net import GainNet, Memory
+from coopoc.text import given_path, replaceable
 from coopoc.world.sensors import stream
 
 INPUTS = (*Memory._fields, "gnss", "velocity", "dt")

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import coopoc as co
-from coopoc.world.pictures import COLORS, INK, PALE, axes, ellipses, pairs
+from coopoc.evaluate.pictures import COLORS, INK, PALE, axes, ellipses, pairs
 
 EGO, STEP, EGOS = 24, 100, [0, 12, 24, 36, 48]
 

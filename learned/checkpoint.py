@@ -17,11 +17,9 @@ from torch import Tensor
 
 from coopoc.arrays import check_fields, instance, named
 from coopoc.errors import InputError, shown
-from coopoc.file_names import given_path, replaceable
 from coopoc.formats.seals import UNSEALED, holds, sealed
-from coopoc.one_file import in_file, path_of
-from coopoc.plugins import find, points
-from coopoc.short_repr import short_repr
+from coopoc.plugins import find, in_file, path_of, points
+from coopoc.text import given_path, replaceable, short_repr
 
 from .nets.gain import Gain
 from .nets.stack import unflatten
@@ -133,7 +131,6 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     """
     path, net = given_path(path), instance("net", net, str, 'Give "mine.py:Net".')
     tensors, card = read(path)
-    history = tensors.pop(_HISTORY, None)
     if not isinstance(card.get("kind"), str) or not isinstance(card.get("net"), dict):
         kind_and_net = {name: card.get(name) for name in ("kind", "net")}
         allowed = "must name a kind of net and its settings"
@@ -147,17 +144,21 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
         model: Gain = made(**card["net"])
     except TypeError as error:
         raise InputError(f"checkpoint {path}: net", card["net"], f"does not fit ({error})", "Train it again.") from None
-    load_into(model, tensors, path)
-    if history is not None:
-        count = sum(p.numel() for p in model.parameters())
-        _match(path, {_HISTORY: (*history.shape[:1], count)}, {_HISTORY: history})
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    expected = {name: tuple(p.shape) for name, p in model.named_parameters()}
+    if _HISTORY in tensors:
+        expected[_HISTORY] = (*shapes[_HISTORY][:1], sum(p.numel() for p in model.parameters()))
+    for name in sorted(expected.keys() | shapes.keys()):
+        if expected.get(name) != shapes.get(name):
+            raise InputError(
+                f"checkpoint {path}",
+                f"{name} of shape {shapes.get(name, 'missing')}",
+                f"expected {expected.get(name, 'no such tensor')}",
+                "Use a net of its card's settings.",
+            )
+    history = tensors.pop(_HISTORY, None)
+    model.load_state_dict(tensors)
     return Checkpoint(model, card, history)
-
-
-def load_into(model: Gain, tensors: Mapping[str, Tensor], path: Path | str = "checkpoint") -> None:
-    """Put named tensors into a net; InputError naming the expected and the given shape if they do not fit."""
-    _match(path, {name: tuple(p.shape) for name, p in model.named_parameters()}, tensors)
-    model.load_state_dict(dict(tensors))
 
 
 def read_card(path: Path | str) -> Mapping[str, Any]:
@@ -181,15 +182,14 @@ def _opened(path: Path) -> Any:
 
 
 def _card(file: Any, path: Path | str) -> dict[str, Any]:
-    text = (file.metadata() or {}).get("card")
-    if text is None:
-        raise InputError("checkpoint", path, "must carry a card in its metadata", "Write it with checkpoint.save.")
     try:
-        card: Any = json.loads(text)
+        card: Any = json.loads((file.metadata() or {}).get("card", "null"))
     except (ValueError, RecursionError) as error:
         raise InputError("checkpoint", path, f"has a damaged card ({error})", "Train it again.") from None
     if not isinstance(card, dict):
-        raise InputError("checkpoint", path, "must have a card of named fields", "Write it with checkpoint.save.")
+        raise InputError(
+            "checkpoint", path, "must carry a card of named fields in its metadata", "Write it with checkpoint.save."
+        )
     return card
 
 
@@ -211,15 +211,3 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         )
         warnings.warn(text, RuntimeWarning, stacklevel=3)
     return content
-
-
-def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor]) -> None:
-    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    for name in sorted(expected.keys() | shapes.keys()):
-        if expected.get(name) != shapes.get(name):
-            raise InputError(
-                f"checkpoint {path}",
-                f"{name} of shape {shapes.get(name, 'missing')}",
-                f"expected {expected.get(name, 'no such tensor')}",
-                "Use a net of its card's settings.",
-            )

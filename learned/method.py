@@ -14,7 +14,7 @@ from coopoc.methods.doubts import doubts
 from coopoc.methods.gaps import in_stretches
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Alone, Track, silent_track
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
 from .stream import GainState, SoloGain, StepByStep
@@ -72,33 +72,28 @@ class LearnedGain(Alone):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` say where fixes contradict them."""
         began, columns = clock(), check_recording(recording).columns(egos)
-        x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
+        fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
+        origin, x0 = fixes[:, :1], self._x0(fixes[:, 0])
+        lanes = _lanes(fixes[:, 1:] - origin), _lanes(speeds[:, 1:]), _lanes(x0[:, None] - origin)[:, 0]
         with one_core(), torch.inference_mode():
-            moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)
+            moved = self.model(*lanes, recording.dt).numpy().astype(np.float64)
         moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, SIZE), 2, 1)
         estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
-        fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
         return silent_track(recording, columns, estimates, None, began, doubts(recording, columns, estimates))
 
-    def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""
-        origin = recording.gnss[:, :1, columns]
-
-        def lanes(array: Floats) -> Tensor:
-            flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], SIZE)
-            return torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32))
-
-        gnss, velocity = recording.gnss[:, 1:, columns] - origin, recording.velocity[:, 1:, columns]
-        return lanes(gnss), lanes(velocity), lanes(self._x0(recording, columns)[:, None] - origin)[:, 0]
-
-    def _x0(self, recording: Recording, columns: list[int]) -> Floats:
-        """(R, E, 3) m, where the filter starts."""
-        fixes: Floats = recording.gnss[:, 0, columns]
+    def _x0(self, fixes: Floats) -> Floats:
+        """(R, E, 3) m, where the filter starts, of its first fixes."""
         if self.x0 is None:
             return fixes
         if np.shape(self.x0) not in (fixes.shape, fixes.shape[1:]):
             allowed = f"must be (R, E, 3) = {fixes.shape} or (E, 3)"
             raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
         return np.broadcast_to(self.x0, fixes.shape)
+
+
+def _lanes(array: Floats) -> Tensor:
+    """(R E, T, 3) for the net of (R, T, E, 3)."""
+    flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], SIZE)
+    return torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32))

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,12 +11,12 @@ import torch
 from coopoc import InputError, Method, Outliers, Sensors
 from coopoc.arrays import check_fields, instance, one_of
 from coopoc.errors import unknown
-from coopoc.file_names import given_path
-from coopoc.one_file import file_digest, in_file
-from coopoc.plugins import find
+from coopoc.plugins import file_digest, find, in_file
+from coopoc.text import given_path
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import load
+from .federation.federate import Plan
 from .nets.gain import Gain
 from .training.clients import Client, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
@@ -60,7 +60,7 @@ class Recipe:
     """Studies and commands train it first when it is named as a method."""
 
     kind: str
-    schedule: Schedule = field(default_factory=Schedule)
+    schedule: Schedule = Schedule()
     rounds: int = 20
     local_epochs: int = 5
     aggregate: str = "mean"
@@ -72,11 +72,16 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("kind of recipe", self.kind, KINDS)
-        if instance("noise", self.noise, str) != STATIC:
-            Outliers.named(self.noise)
         check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
+        if self.noise != STATIC:
+            Outliers.named(self.noise)
         instance("options", self.options, tuple)
         check_pieces(self.piece, self.split)
+
+    @property
+    def plan(self) -> Plan:
+        """Of a federation, how it trains."""
+        return Plan(self.rounds, self.aggregate, self.local_epochs, self.schedule)
 
 
 RECIPES: dict[str, Recipe] = {

@@ -15,19 +15,19 @@ import torch
 
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import listed, number
-from coopoc.file_names import given_path
-from coopoc.one_file import in_file
+from coopoc.plugins import in_file
+from coopoc.text import given_path
 from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
-from .federation.federate import Plan, federate_many
+from .federation.federate import federate_many
 from .nets.gain import Gain
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
 from .training.fit import Task, fit_many
-from .training.machine import reporting_on
+from .training.machine import LINE
 from .training.okf_fit import fit_okf
 
 
@@ -112,19 +112,20 @@ def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progres
 
 def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[Checkpoint]:
     """Checkpoints of jobs of one recipe, trained together now."""
-    data = {job.setting: job_clients(job, fleet) for job in group}
+    drawn = {job.setting: job_clients(job, fleet) for job in group}
+    data = {job: _own(job, drawn[job.setting]) for job in group}
     models = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
     return [
-        replace(made, card=_card(job, fleet, data[job.setting]) | dict(made.card))
+        replace(made, card=_card(job, fleet, data[job]) | dict(made.card))
         for job, made in zip(group, models, strict=True)
     ]
 
 
 def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
     """RT-LE on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
-    data = job_clients(job, fleet)
-    noise_model = NoiseModel.fitted(*_drives(_joined(data, job.client, "training")))
-    recording, truth = _drives(_joined(data, job.client, "validation"))
+    data = _own(job, job_clients(job, fleet))
+    noise_model = NoiseModel.fitted(*_drives(_joined(data, "training")))
+    recording, truth = _drives(_joined(data, "validation"))
     methods = model.method(job.name), Kalman(noise_model)
     ours, theirs = (np.nansum((method(recording, recording.ids).x[0] - truth.position) ** 2) for method in methods)
     return float(np.sqrt(ours / theirs))
@@ -138,18 +139,17 @@ def _drives(segments: Segments) -> tuple[Recording, Fleet]:
     truth = np.where(np.isnan(truth).all(axis=(0, 1)), 0.0, truth)
     names = tuple(map(str, range(gnss.shape[1])))
     fleet = Fleet(names, segments.dt * np.arange(len(gnss)), truth, 0 * truth)
-    still = replace(fleet, position=np.zeros_like(truth), velocity=np.zeros_like(truth))
-    recording = observe(still, Sensors(), V2X(max_neighbours=0))
+    recording = observe(fleet, Sensors(), V2X(max_neighbours=0))
     return replace(recording, gnss=gnss[None], velocity=velocity[None]), fleet
 
 
 def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
     leave_with(parent)
-    with reporting_on(line or 0):
-        _train(group, fleet, out, worst, line is not None)
+    LINE.set(line or 0)
+    _train(group, fleet, out, worst, line is not None)
 
 
-Data = dict[Setting, tuple[Client, ...]]
+Data = dict[Job, Sequence[Client]]
 Trainer = Callable[[Sequence[Job], Data, str | None], list[Checkpoint]]
 
 
@@ -158,39 +158,42 @@ def _made(path: Path, key: str) -> bool:
 
 
 def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
-    used = [c for i, c in enumerate(data) if job.client in (None, i + 1)]
     return {
         **job.card,
         "key": job.key(fleet),
         **({"noise": "measured"} if isinstance(fleet, MeasuredDrives) else {}),
         "fleet": fleet.name,
         "digest": fleet.digest,
-        "clients": [c.name for c in used],
-        "training_pieces": [len(c.training) for c in used],
-        "validation_pieces": [len(c.validation) for c in used],
+        "clients": [c.name for c in data],
+        "training_pieces": [len(c.training) for c in data],
+        "validation_pieces": [len(c.validation) for c in data],
     }
 
 
-def _joined(data: Sequence[Client], client: int | None, part: str) -> Segments:
-    return Segments.join([getattr(c, part) for i, c in enumerate(data) if client in (None, i + 1)])
+def _own(job: Job, everyone: Sequence[Client]) -> Sequence[Client]:
+    """The clients that train a job."""
+    return everyone if job.client is None else [everyone[job.client - 1]]
+
+
+def _joined(data: Sequence[Client], part: str) -> Segments:
+    return Segments.join([getattr(c, part) for c in data])
 
 
 def _task(job: Job, data: Sequence[Client]) -> Task:
-    training, validation, long = (_joined(data, job.client, part) for part in ("training", "validation", "long"))
+    training, validation, long = (_joined(data, part) for part in ("training", "validation", "long"))
     return Task(untrained(job), training, validation, job.setting.seed, str(job.client or ""), long)
 
 
 def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
-    plan = Plan(recipe.rounds, recipe.aggregate, recipe.local_epochs, recipe.schedule)
-    done = federate_many(nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], plan, stage)
-    parts = [[client.training for client in data[job.setting]] for job in todo]
+    nets, groups, seeds = [untrained(j) for j in todo], [data[j] for j in todo], [j.setting.seed for j in todo]
+    done = federate_many(nets, groups, seeds, todo[0].recipe.plan, stage)
+    parts = [[client.training for client in group] for group in groups]
     return [Checkpoint(fed.model.calibrate(own), fed.card, fed.weights) for fed, own in zip(done, parts, strict=True)]
 
 
 def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     made = []
-    for fit in fit_many([_task(job, data[job.setting]) for job in todo], todo[0].recipe.schedule, stage):
+    for fit in fit_many([_task(job, data[job]) for job in todo], todo[0].recipe.schedule, stage):
         rows = [
             {name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in fit.history
         ]
@@ -200,7 +203,7 @@ def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoi
 
 
 def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    tasks = [(_joined(data[j.setting], None, "training"), _joined(data[j.setting], None, "validation")) for j in todo]
+    tasks = [(_joined(data[job], "training"), _joined(data[job], "validation")) for job in todo]
     return list(starmap(Checkpoint, fit_okf(tasks, todo[0].recipe.schedule.epochs, progress=stage)))
 
 

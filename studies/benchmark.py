@@ -19,8 +19,7 @@ from coopoc.errors import said, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
-from coopoc.one_file import in_file
-from coopoc.plugins import find
+from coopoc.plugins import find, in_file
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
 from coopoc.workers import progress_bar

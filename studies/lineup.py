@@ -10,10 +10,9 @@ import numpy as np
 from coopoc import InputError, Study
 from coopoc.arrays import Floats, refuse
 from coopoc.errors import unknown
-from coopoc.file_names import given_path
-from coopoc.one_file import in_file
-from coopoc.plugins import find, names
+from coopoc.plugins import find, in_file, names
 from coopoc.study.study import Params, Row
+from coopoc.text import given_path
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 

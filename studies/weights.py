@@ -12,8 +12,7 @@ from tyro.conf import Positional, arg
 
 from coopoc import V2X, InputError, Sensors, observe
 from coopoc.errors import unknown
-from coopoc.one_file import file_digest, from_file, in_file
-from coopoc.plugins import find
+from coopoc.plugins import file_digest, find, from_file, in_file
 from coopoc.study.study import Params
 from coopoc.world.sensors import VelocityReading
 

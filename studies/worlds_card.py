@@ -16,7 +16,7 @@ from coopoc import InputError, Method, nees, rt_le
 from coopoc.arrays import number
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
-from coopoc.one_file import file_digest, in_file
+from coopoc.plugins import file_digest, in_file
 from coopoc.study.cell import Cell
 from coopoc.study.compute import compute
 from coopoc.study.numbers import three

@@ -20,9 +20,8 @@ from coopoc.evaluate.metrics import measure
 from coopoc.fleets import load_fleet
 from coopoc.formats.trajectories import read_tum
 from coopoc.methods.catalogue import needs_whole_fleet
-from coopoc.one_file import from_file
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
-from coopoc.plugins import find
+from coopoc.plugins import find, from_file
 from coopoc.studies.lineup import own
 from coopoc.study.results import Results
 from coopoc.study.run import run_study

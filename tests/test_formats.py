@@ -246,5 +246,6 @@ def test_a_tum_file_is_numpys_table(tmp_path):
     quaternion = Rotation.from_matrix(poses.rotation).as_quat()
     np.savetxt(tmp_path / "a.tum", np.c_[poses.stamps, poses.position, quaternion], fmt="%.17g")
     again = read_tum(tmp_path / "a.tum")
-    assert_same(replace(again, rotation=poses.rotation), poses)
+    assert_array_equal(again.stamps, poses.stamps)
+    assert_array_equal(again.position, poses.position)
     assert_allclose(again.rotation, poses.rotation, atol=1e-15)

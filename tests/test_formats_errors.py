@@ -141,7 +141,7 @@ TUM = "# t x y z qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 0.999\n"
     ],
 )
 def test_a_bad_line_of_a_trajectory_is_named(tmp_path, text, thing, hint):
-    assert len(read_tum(_file(tmp_path / "a.tum", TUM))) == 2
+    assert len(read_tum(_file(tmp_path / "a.tum", TUM)).stamps) == 2
     _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, hint)
 
 

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from coopoc.learned import GainNet
 from coopoc.learned.engine.layers import sigmoid, tanh
+from coopoc.learned.engine.optimiser import Moments, Update
 from coopoc.learned.nets.gain import Gain, Recurrent
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core
-from coopoc.learned.training.schedule import Moving, Schedule
 
 
 @pytest.fixture(autouse=True)
@@ -104,34 +104,29 @@ def test_float64_agrees_with_the_reference_with_gaps_and_variable_dt():
     torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
 
 
-def moving(nets: list[GainNet]) -> Moving:
-    theta = flatten(nets)
-    return Moving(theta, torch.zeros_like(theta), torch.zeros_like(theta))
-
-
 @pytest.mark.parametrize("descend", [GainNet.descend, Gain.descend], ids=["whole", "by parts"])
 def test_descent_is_that_of_torch(descend):
     """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the reference; other rows stay, and so does a
     row whose loss is not finite."""
     nets, data = [GainNet(2, 1, seed=s).double() for s in range(4)], batch(3, 3, 12, gaps=0.2)
     data.truth[:, 1] = torch.inf
-    state, schedule = moving(nets), Schedule(weight_decay=0.3, clip=0.5)
-    started, rates = state.theta.clone(), np.array([1e-2, 2e-2, 3e-2])
+    theta, rates = flatten(nets), np.array([1e-2, 2e-2, 3e-2])
+    started, state = theta.clone(), Moments(theta.numpy(), np.zeros(theta.shape), np.zeros(theta.shape))
     leaves = {0: nets[0], 2: nets[3]}
     optimisers = {row: torch.optim.AdamW(net.parameters(), rates[row], weight_decay=0.3) for row, net in leaves.items()}
     for step in range(1, 4):
-        losses, taken = descend(nets[0], state, np.array([0, 1, 3]), data, step, rates, schedule)
-        assert taken.tolist() == [True, False, True]
+        outcome = descend(nets[0], state, data, Update(np.array([0, 1, 3]), step, rates, 0.3, 0.5))
+        assert outcome.finite.tolist() == [True, False, True]
         for row, net in leaves.items():
             gnss, velocity, truth = (part[:, row].transpose(0, 1) for part in data[:3])
             loss = (Recurrent.forward(net, gnss, velocity, data.x0[row], 0.1) - truth).square().sum(-1).mean()
-            torch.testing.assert_close(losses[row], loss.detach(), rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(outcome.losses[row], loss.item(), rtol=1e-10, atol=1e-12)
             optimisers[row].zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), 0.5)
             optimisers[row].step()
-    torch.testing.assert_close(state.theta[[0, 3]], flatten([*leaves.values()]), rtol=1e-8, atol=1e-10)
-    assert torch.equal(state.theta[1:3], started[1:3])
+    torch.testing.assert_close(theta[[0, 3]], flatten([*leaves.values()]), rtol=1e-8, atol=1e-10)
+    assert torch.equal(theta[1:3], started[1:3])
 
 
 def test_gradients_of_inputs_and_weights_go_through_the_reference():

@@ -95,7 +95,7 @@ def test_a_path_that_no_program_could_read_is_refused(tmp_path):
     for write, named in (
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], gap), "pose 1"),
         (lambda: co.write_tum(tmp_path / "a", [0.1, 0.1], np.zeros((2, 3))), "column t"),
-        (lambda: co.write_tum(tmp_path / "a", [0.0], np.zeros((2, 3))), "stamps"),
+        (lambda: co.write_tum(tmp_path / "a", [0.0], np.zeros((2, 3))), "t = shape"),
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 2))), "position"),
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 3)), [0.0]), "heading"),
         (lambda: co.write_tum("", [0.0, 0.1], np.zeros((2, 3))), "path"),

@@ -15,7 +15,7 @@ from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.star import stars
-from coopoc.one_file import from_file
+from coopoc.plugins import from_file
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()

@@ -21,6 +21,7 @@ import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.picture import draw
 from coopoc.data.log.read import read_log
+from coopoc.evaluate.pictures import ellipses
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
 from coopoc.study.report import report
@@ -28,7 +29,6 @@ from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table
-from coopoc.world.pictures import ellipses
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import coopoc as co
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import GainNet
 from coopoc.learned.federation.federate import federate
-from coopoc.one_file import from_file
+from coopoc.plugins import from_file
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ..arrays import Floats, checked, number, one_of, refuse, texts
 from ..errors import InputError
 from ..methods.track import Track, of_recording
-from ..short_repr import short_repr
+from ..text import short_repr
 from ..world.recording import Recording
 from ..world.v2x import Message
 

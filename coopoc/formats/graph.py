@@ -5,14 +5,15 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import InitVar, dataclass, fields
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import AnyArray, Bools, Floats, Ints, frozen
+from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
-from ..short_repr import short_repr
+from ..text import short_repr
 from .values import LEAST, UNIT, to_rotation
 
 ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be
@@ -246,14 +247,15 @@ def check(graph: Graph, location: Location) -> None:
     n, d = len(graph.names), graph.dimension
     if not n:
         raise InputError("names", "0 vertices", "must be at least one", "Check that the file is complete.")
+    kinds: dict[str, Edges] = {field: getattr(graph, field) for field in ENDS}
     wanted = {"is_pose": (n,), "position": (n, d), "orientation": (n, 1 if d == 2 else 4), "stamps": (n,)}
-    for field, shape in wanted.items():
-        _shape(field, getattr(graph, field), shape)
+    for field, edges in kinds.items():
+        wanted |= {f"{field}.{name}": shape for name, shape in shapes(field, d, len(edges)).items()}
+    for name, shape in wanted.items():
+        if (actual := attrgetter(name)(graph).shape) != shape:
+            raise InputError(name, f"shape {actual}", f"must have shape {shape}", "One row per vertex or edge.")
     _vertices(graph, location)
-    for field in ENDS:
-        edges = getattr(graph, field)
-        for name, shape in shapes(field, d, len(edges)).items():
-            _shape(f"{field}.{name}", getattr(edges, name), shape)
+    for field, edges in kinds.items():
         if len(edges):
             _ends(graph, field, edges.nodes, location)
             _values(edges, field, location)
@@ -348,8 +350,3 @@ def _refuse(
     if len(rows):
         entry = np.asarray(values)[rows[0]].tolist()
         raise InputError(location(field, int(rows[0])), f"{label}{entry}", allowed, hint)
-
-
-def _shape(field: str, array: AnyArray, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise InputError(field, f"shape {array.shape}", f"must have shape {shape}", "One row per vertex or edge.")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ..file_names import given_path
+from ..text import given_path
 from .graph import ENDS, NAME, Graph
 from .records import Grammar, by_tag
 from .values import read_words

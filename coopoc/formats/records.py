@@ -1,8 +1,8 @@
 """Records of PyFG and g2o: a line is a tag, perhaps a stamp, vertices, numbers and the noise of a measurement."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,13 +76,12 @@ def by_tag(tags: Mapping[int, str], stamped: Collection[str] = (), offset: Colle
     return {tag: Record(kind, d, kind in stamped, tag in offset) for tag, (kind, d) in made.items()}
 
 
-@dataclass
-class _Rows:
+class _Rows(NamedTuple):
     """The lines of one kind: what they are, and for each its number and words."""
 
     tag: str
-    lines: list[int] = field(default_factory=list)
-    words: list[list[str]] = field(default_factory=list)
+    lines: list[int]
+    words: list[list[str]]
 
 
 @dataclass(frozen=True)
@@ -177,7 +176,7 @@ class Grammar:
                 raise InputError(location, tag, f"must be {dimension}-D as {since}", hint)
             if len(words) != width[tag]:
                 raise malformed(file, number, words, self.form(tag))
-            of_kind = rows.setdefault(record.kind, _Rows(tag))
+            of_kind = rows.setdefault(record.kind, _Rows(tag, [], []))
             of_kind.lines.append(number)
             of_kind.words.append(words)
         if not {"pose", "point"} & set(rows) and not (self.implied and dimension):

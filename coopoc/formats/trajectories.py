@@ -1,82 +1,39 @@
 """Trajectories: poses over time, in TUM files (`t x y z qx qy qz qw`)."""
 
 from collections.abc import Callable
-from dataclasses import InitVar, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, frozen
+from ..arrays import Floats, checked
 from ..errors import InputError
-from ..file_names import given_path
-from ..short_repr import short_repr
+from ..text import given_path
 from .values import UNIT, read_table, to_orientation, to_rotation
 
-ORTHONORMAL = 1e-3
-"""Largest entry of |R R^T - I| of a matrix that was merely rounded."""
 
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(NamedTuple):
     """T poses of one body in one frame.
 
     Args:
-        stamps: (T,) s, increasing, or None where the file has none.
+        stamps: (T,) s, increasing.
         position: (T, 3) m.
         rotation: (T, 3, 3), body to frame.
-        location: row -> where it came from, for messages; readers pass the line of the file.
-
-    Raises:
-        InputError: shapes, a number that is not finite, stamps that do not increase, or a matrix that is no rotation:
-            not orthonormal to within 1e-3, or a reflection.
-
-    >>> len(Trajectory(None, np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))))
-    4
     """
 
-    stamps: Floats | None
+    stamps: Floats
     position: Floats
     rotation: Floats
-    location: InitVar[Callable[[int], str] | None] = None
-
-    __repr__ = short_repr
-
-    def __post_init__(self, location: Callable[[int], str] | None) -> None:
-        for field in ("position", "rotation", *(() if self.stamps is None else ("stamps",))):
-            self.__dict__[field] = frozen(getattr(self, field))
-        _check(self, location or "pose {}".format)
-
-    def __len__(self) -> int:
-        return len(self.position)
 
 
-def _check(poses: Trajectory, location: Callable[[int], str]) -> None:
-    count = len(poses)
-    for field, shape in {"stamps": (count,), "position": (count, 3), "rotation": (count, 3, 3)}.items():
-        array = getattr(poses, field)
-        if array is not None and array.shape != shape:
-            raise InputError(field, f"shape {array.shape}", f"must have shape {shape}", "One row per pose.")
-    stamps = np.arange(count) if poses.stamps is None else poses.stamps
-    bad = np.flatnonzero(
-        ~np.isfinite(np.column_stack([stamps, poses.position, poses.rotation.reshape(count, 9)])).all(1)
-    )
-    if len(bad):
-        raise InputError(location(bad[0]), poses.position[bad[0]], "must be finite numbers", "Remove the pose.")
+def _check_order(stamps: Floats, location: Callable[[int], str]) -> None:
+    """InputError at the first pose that is no later than the one before."""
     late = 1 + np.flatnonzero(np.diff(stamps) <= 0)
     if len(late):
         order = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
         hint = "Sort the poses by time, and remove one that repeats."
         raise InputError(f"{location(late[0])}, column t", order, "must increase", hint)
-    off = np.abs(poses.rotation @ poses.rotation.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
-    bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(poses.rotation) < 0))
-    if len(bad):
-        raise InputError(
-            location(bad[0]),
-            f"rotation {poses.rotation[bad[0]].round(6).tolist()}",
-            f"must be orthonormal to within {ORTHONORMAL:g}, with determinant 1",
-            "Check the order of the numbers.",
-        )
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -107,8 +64,8 @@ def read_tum(path: str | Path) -> Trajectory:
             f"must have length 1 to within {UNIT:g}",
             "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
         )
-    rotation = to_rotation(table[:, 4:])
-    return Trajectory(table[:, 0], table[:, 1:4], rotation, location=lambda row: f"{path.name}: line {lines[row]}")
+    _check_order(table[:, 0], lambda row: f"{path.name}: line {lines[row]}")
+    return Trajectory(table[:, 0], table[:, 1:4], to_rotation(table[:, 4:]))
 
 
 def write_tum(
@@ -132,10 +89,14 @@ def write_tum(
     >>> read_tum(file).rotation[1].round(6).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    stamps, where = checked("t", t, "(T,)", (-1,)), checked("position", position, "(T, 3)", (-1, 3))
+    where = checked("position", position, "(T, 3)", (-1, 3))
+    stamps = checked("t", t, "(T,)", (len(where),))
     course = np.zeros(len(where)) if heading is None else checked("heading", heading, "(T,)", (len(where),))
+    poses = np.column_stack([stamps, where, course])
+    bad = np.flatnonzero(~np.isfinite(poses).all(axis=1))
+    if len(bad):
+        raise InputError(f"pose {bad[0]}", poses[bad[0]], "must be finite numbers", "Remove the pose.")
+    _check_order(stamps, "pose {}".format)
     rotation = np.tile(np.eye(3), (len(where), 1, 1))
     rotation[:, :2, :2] = to_rotation(course[:, None])
-    poses = Trajectory(stamps, where, rotation)
-    rows = np.column_stack([stamps, poses.position, to_orientation(poses.rotation)])
-    np.savetxt(given_path(path), rows, fmt="%.9f")
+    np.savetxt(given_path(path), np.column_stack([stamps, where, to_orientation(rotation)]), fmt="%.9f")

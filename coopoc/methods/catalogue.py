@@ -3,8 +3,7 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from ..one_file import in_file
-from ..plugins import find, names
+from ..plugins import find, in_file, names
 from .baselines import LKFSA, MSMV
 from .batch_smoother import BatchSmoother
 from .cooperative_filter import CooperativeFilter

@@ -12,7 +12,7 @@ from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise, own_variances
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
-from ..short_repr import short_repr
+from ..text import short_repr
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from .calibration import calibrated, scaled

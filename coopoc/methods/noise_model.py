@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints, check_texts, checked, instance, number, refuse, texts
+from ..arrays import Floats, Ints, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
-from ..short_repr import short_repr
+from ..text import short_repr
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
 from ..world.links import vector_cov
@@ -49,12 +49,8 @@ class NoiseModel:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_texts(self, "name")
+        check_fields(self)
         self.__dict__["notes"] = texts("notes", self.notes)
-        if self.sensors is not None:
-            instance("sensors", self.sensors, Sensors)
-        if self.fleet is not None:
-            instance("fleet", self.fleet, Fleet)
         if self.process_std is None and self.sensors is None:
             hint = "Give process_std=(1.0, 1.0, 1.0), or sensors=Sensors(), whose noise follows the speed."
             raise InputError("process_std", None, "must be given where there are no sensors", hint)

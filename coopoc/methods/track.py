@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown
 from ..kernels.compiling.waiting import clock
-from ..short_repr import short_repr
+from ..text import short_repr
 from ..world.fleet import columns, same_drive
 from ..world.long_table import long_table
 from ..world.recording import Recording, Vehicles

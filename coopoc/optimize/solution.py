@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..short_repr import short_repr
+from ..text import short_repr
 from .model.problem import no_such_node
 from .model.space import Space
 

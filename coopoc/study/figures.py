@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
 from ..errors import InputError
-from ..escapes import picture
 from ..evaluate.statistics import Interval
+from ..text import picture
 from .numbers import Number, Where, interval, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
 from .style import Panel, look, words

@@ -11,7 +11,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from ..errors import InputError
-from ..file_names import file_name
+from ..text import file_name
 from . import store
 
 NAME = "manifest.json"

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-from ..escapes import picture
+from ..text import picture
 from . import store
 from .style import RC, line, look
 

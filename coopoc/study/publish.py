@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, unknown
-from ..file_names import file_name, given_path
+from ..text import file_name, given_path
 from ..workers import progress_bar
 from . import store
 from .results import Results

@@ -14,8 +14,8 @@ from tyro.conf import Positional, arg
 
 from ..errors import InputError
 from ..evaluate.statistics import Interval
-from ..file_names import given_path
 from ..plugins import names
+from ..text import given_path
 from . import store
 from .results import SEED, Results, ego_by_run
 from .study import Params, find_study

@@ -11,8 +11,7 @@ from markupsafe import Markup, escape
 
 from ..arrays import listed
 from ..errors import InputError
-from ..escapes import uncontrolled
-from ..file_names import given_path, inside
+from ..text import given_path, inside, uncontrolled
 from . import store
 from .manifest import environments
 from .publish import views

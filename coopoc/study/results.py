@@ -12,8 +12,7 @@ import pyarrow as pa
 from ..arrays import Floats
 from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, mean_interval
-from ..file_names import given_path
-from ..short_repr import short_repr
+from ..text import given_path, short_repr
 from . import store
 from .cell import Params, assignments, parse
 from .manifest import read

@@ -8,8 +8,8 @@ from typing import Any
 
 from ..arrays import instance, named, number
 from ..errors import InputError
-from ..file_names import given_path
 from ..formats.trajectories import write_tum
+from ..text import given_path
 from ..workers import progress_bar
 from ..world.fleet import Fleet
 from ..world.recording import Recording

@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..errors import InputError
-from ..file_names import replaceable
 from ..formats.seals import UNSEALED, holds, sealed
+from ..text import replaceable
 from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")

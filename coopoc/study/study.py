@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, unknown
-from ..file_names import file_name
-from ..one_file import file_digest, from_file, in_file
-from ..plugins import find
+from ..plugins import file_digest, find, from_file, in_file
+from ..text import file_name
 from .cell import Cell, Params, Row, Scalar, digest, parse
 from .provenance import code_of
 

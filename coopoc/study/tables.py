@@ -12,8 +12,8 @@ from tabulate import tabulate
 
 from ..arrays import one_of
 from ..errors import InputError
-from ..escapes import markdown, spreadsheet, tex, visible
 from ..evaluate.statistics import Interval
+from ..text import markdown, spreadsheet, tex, visible
 from .numbers import Number, Where, alike
 from .style import METHODS, label, title, words
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, check_arrays, check_texts, checked, listed, number
+from ..arrays import Bools, Floats, check_arrays, check_fields, checked, listed, number
 from ..errors import InputError, shown, unknown
 from .long_table import long_table
 from .plausible import FARTHEST, FASTEST, headings, plausible
@@ -53,7 +53,7 @@ class Fleet:
 
     def __post_init__(self) -> None:
         self.__dict__["ids"] = names(self.ids)
-        check_texts(self, "name", "source", "licence")
+        check_fields(self)
         self.__dict__["t"] = clock(self.t)
         shape = len(self.t), len(self.ids), 3
         positions = "(T, N, 3)", shape
@@ -78,8 +78,8 @@ class Fleet:
     def digest(self) -> str:
         """SHA-256 of ids, time and truth: the same numbers give the same digest."""
         sha = hashlib.sha256("\n".join(self.ids).encode())
-        for array in (self.t, self.position, self.velocity, *(() if self.heading is None else (self.heading,))):
-            sha.update(np.ascontiguousarray(array).tobytes())
+        for name in ("t", *self._arrays):
+            sha.update(getattr(self, name).tobytes())
         return sha.hexdigest()
 
     def require(self, ids: Sequence[str], t: Floats) -> None:

@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse, texts
-from ..errors import InputError, shown
-from ..short_repr import short_repr
+from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, texts
+from ..errors import InputError
+from ..text import short_repr
 from .fleet import clock, columns, interval, names
 from .links import Links, drop_steep_azimuths, stretches
 from .plausible import FARTHEST, FASTEST, FASTEST_TURN, headings, plausible, radians
@@ -113,9 +113,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
-            if not isinstance(getattr(self, name), kind):
-                actual, allowed = shown(getattr(self, name)), f"must be {kind.__name__}"
-                raise InputError(name, actual, allowed, f"Give {kind.__name__}(...).")
+            instance(name, getattr(self, name), kind)
         ids, t, links = names(self.ids), clock(self.t), len(self.links)
         gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
         shapes: dict[str, tuple[str, tuple[int, ...], Any]] = {
@@ -135,8 +133,8 @@ class Recording:
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
         if self.body is not None:
             instance("body", self.body, Body).check(self.velocity)
-        factor = checked("fix_factor", self.fix_factor, "(N,) or (0,)", (-1,))
-        factor = checked("fix_factor", factor, "(N,) or (0,)", (len(ids) if len(factor) else 0,))
+        stated = len(ids) if plain(self.fix_factor).size else 0
+        factor = checked("fix_factor", self.fix_factor, "(N,) or (0,)", (stated,))
         wrong, allowed = ~((factor > 0) & (factor < np.inf)), "must be > 0 and finite"
         refuse("fix_factor", factor, wrong, allowed, "1 is as `sensors` says.")
         self.__dict__["fix_factor"] = tuple(factor.tolist())
@@ -236,10 +234,6 @@ class Recording:
         """(R, L, 3) `relative` without azimuths of what is straight above or below, as estimators take it."""
         return drop_steep_azimuths(self.relative)
 
-    @cached_property
-    def _observing(self) -> frozenset[int]:
-        return frozenset(self.observers)
-
     def neighbours(self, ego: int | str) -> Ints:
         """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
         (column,) = columns("ego", [ego], self.ids)
@@ -251,8 +245,9 @@ class Recording:
         cols = columns("egos", egos, self.ids)
         if not cols:
             raise InputError("egos", egos, "must name at least one vehicle", "Give [0] for the first.")
+        observers = frozenset(self.observers)
         for ego, col in zip(egos, cols, strict=True):
-            if col not in self._observing:
+            if col not in observers:
                 allowed = f"has no links here, only {list(self.observers)} have"
                 raise InputError("egos", repr(ego), allowed, "Name it in observe(..., observers=[...]).")
         return cols
@@ -261,24 +256,15 @@ class Recording:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or, if it
         must be `fixed`, without a first fix. Later ones may be missing (NaN)."""
         cols = self.observing(egos)
-        moves, has_fix = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss[:, :1]))
-        if moves.all() and has_fix.all():
-            return cols
-        there: Bools = np.asarray(moves.all(axis=(0, 1, 3)))
-        begins: Bools = np.asarray(has_fix.all(axis=(0, 1, 3))) | (not fixed)
-        for ego, present, fix in zip(egos, there, begins, strict=True):
-            if not present:
+        for ego, column in zip(egos, cols, strict=True):
+            if np.isnan(self.velocity[:, :, column]).any():
                 hint = (
                     "Cut it with recording.between(...), recording.stretches(ego) names its parts, or choose another."
                 )
                 raise InputError("egos", repr(ego), "is absent at some steps", hint)
-            if not fix:
-                raise InputError(
-                    "egos",
-                    repr(ego),
-                    "has no fix at step 0",
-                    "Cut the drive, or take the cooperative filter.",
-                )
+            if fixed and np.isnan(self.gnss[:, 0, column]).any():
+                hint = "Cut the drive, or take the cooperative filter."
+                raise InputError("egos", repr(ego), "has no fix at step 0", hint)
         return cols
 
     def __repr__(self) -> str:

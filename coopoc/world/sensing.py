@@ -10,7 +10,7 @@ from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of, se
 from ..errors import InputError
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
-from .faults import PAIRS, wrong_fixes, wrong_odometry, wrong_relative
+from .faults import PAIRS, Pairs, wrong_fixes, wrong_odometry, wrong_relative
 from .fleet import Fleet, columns, interval
 from .links import Links, spherical, wrap
 from .recording import Recording, Vehicles
@@ -223,12 +223,12 @@ def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, remove_outli
     return velocity
 
 
-def _pairs(ids: Sequence[str], links: Links) -> list[tuple[str, str, Ints]]:
-    """(observer id, neighbour id, link indices in time order) of every pair that is ever linked."""
+def _pairs(ids: Sequence[str], links: Links) -> Pairs:
+    """Every pair that is ever linked, its links in time order."""
     key = links.observer * len(ids) + links.neighbour
     order = np.argsort(key, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
-    return [(ids[links.observer[g[0]]], ids[links.neighbour[g[0]]], g) for g in groups]
+    return [(ids[links.observer[g[0]]], ids[links.neighbour[g[0]]], g, links.step[g]) for g in groups]
 
 
 def _relative_measurements(
@@ -237,8 +237,8 @@ def _relative_measurements(
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
-    pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet.ids, links)]
-    relative, turned = np.empty((runs, *exact.shape)), _own_errors(fleet, links, sensors, runs, seed, *HEADING)
+    pairs, relative = _pairs(fleet.ids, links), np.empty((runs, *exact.shape))
+    turned = _own_errors(fleet, links, sensors, runs, seed, *HEADING)
     longer = _own_errors(fleet, links, sensors, runs, seed, "range_offset")
     scratch = np.empty((len(fleet.t), 3))
     for r in range(runs):  # one after the other stays in the cache
@@ -289,7 +289,7 @@ def schedule(ids: Sequence[str], t: Floats, links: Links, v2x: V2X, runs: int, s
     arrival = np.where(sent, links.step + delay, -1)[None].repeat(runs, axis=0)
     if v2x.loss > 0:
         number = (np.cumsum(sends, axis=0) - 1)[links.step, links.neighbour]
-        for observer, neighbour, pair in _pairs(ids, links):
+        for observer, neighbour, pair, _ in _pairs(ids, links):
             index = pair[sent[pair]]
             size = int(number[index].max(initial=-1)) + 1
             draws = np.stack([stream(seed, "loss", r, observer, neighbour).uniform(size=size) for r in range(runs)])

@@ -142,21 +142,11 @@ class Sensors:
 
     def check_assumed(self) -> "Sensors":
         """Itself, if a method may assume it; InputError where an assumed std is zero."""
-        stds = {
-            "gnss_std": min(self.gnss_std),
-            "range_std": self.range_std,
-            "azimuth_std": self.azimuth_std,
-            "inclination_std": self.inclination_std,
-            "velocity_floor": self.velocity_floor,
-        }
-        for name, value in stds.items():
-            if value <= 0:
-                raise InputError(
-                    name,
-                    getattr(self, name),
-                    "is zero: noise may act with zero std but not be assumed with it",
-                    "Pass observe(..., assumed=Sensors(...)) with positive standard deviations.",
-                )
+        for name in ("gnss_std", "range_std", "azimuth_std", "inclination_std", "velocity_floor"):
+            if np.min(value := getattr(self, name)) <= 0:
+                allowed = "is zero: noise may act with zero std but not be assumed with it"
+                hint = "Pass observe(..., assumed=Sensors(...)) with positive standard deviations."
+                raise InputError(name, value, allowed, hint)
         return self
 
     @classmethod

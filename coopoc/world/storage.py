@@ -13,7 +13,7 @@ from numpy.lib import format as npy
 
 from ..arrays import AnyArray, instance
 from ..errors import InputError, said
-from ..file_names import given_path
+from ..text import given_path
 from .fleet import Fleet
 from .links import Links
 from .outliers import Fault, Outliers

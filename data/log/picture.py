@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from coopoc import plot_recording
-from coopoc.escapes import picture
-from coopoc.world.pictures import COLORS, INK, axes
+from coopoc.evaluate.pictures import COLORS, INK, axes
+from coopoc.text import picture
 
 from .residuals import Check
 

@@ -12,8 +12,7 @@ import pandas as pd
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Floats, checked, instance, named, number, one_of, refuse, texts
 from coopoc.errors import suggestion
-from coopoc.file_names import given_path
-from coopoc.short_repr import short_repr
+from coopoc.text import given_path, short_repr
 from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED

@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
 
 @compiled
 def advance(moments: Moments, outcome: Outcome, update: Update) -> None:
-    """`schedule.advance`: change weights and moments (S, P) of the rows (R,) in place by their gradients (R, P).
+    """Change weights and moments (S, P) of the rows (R,) in place by their gradients (R, P): clipped, then AdamW.
 
     Where loss or gradient is not finite, `outcome.finite` becomes false and nothing is changed.
     """

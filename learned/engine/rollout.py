@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from coopoc import InputError
-from coopoc.arrays import AnyArray, Floats, Ints
+from coopoc.arrays import AnyArray
 
 from ..training.clients import Batch
-from ..training.schedule import Moving, Schedule, update_of
 from . import backward, forward
 from .forward import Drives
 from .layers import Shapes, plan_of
@@ -60,22 +59,13 @@ def loss_and_gradient(theta: Tensor, shapes: Shapes, batch: Batch) -> tuple[Tens
     tensor([0.])
     """
     update = Update(np.arange(len(theta)), 0, np.empty(0), 0.0, 0.0)
-    outcome = _step(theta, shapes, batch, Moments(*[_array(theta, theta.dtype)] * 3), update)
+    outcome = descend(Moments(*[_array(theta, theta.dtype)] * 3), shapes, batch, update)
     return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.gradient)
 
 
-def descend(
-    moving: Moving, rows: Ints, shapes: Shapes, batch: Batch, step: int, rates: Floats, schedule: Schedule
-) -> tuple[Tensor, Tensor]:
-    """One optimiser step in place of the rows (R,) of weights and moments, as `Gain.descend`."""
-    moments = Moments(*(a.numpy() for a in moving))
-    outcome = _step(moving.theta, shapes, batch, moments, update_of(rows, step, rates, schedule))
-    return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.finite)
-
-
-def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update: Update) -> Outcome:
+def descend(moments: Moments, shapes: Shapes, batch: Batch, update: Update) -> Outcome:
     """Losses (R,) and gradients (R, P) of the rows, and an optimiser step if the update asks for one."""
-    plan, models = plan_of(shapes), len(update.rows)
+    theta, plan, models = torch.from_numpy(moments.theta), plan_of(shapes), len(update.rows)
     drives = _checked(theta, shapes, models, batch.gnss, batch.velocity, batch.x0, batch.dt)
     truth = _array(batch.truth, theta.dtype)
     if truth.shape != drives.gnss.shape:
@@ -102,10 +92,10 @@ def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity:
         if array.shape != shape:
             raise InputError(name, f"shape {tuple(array.shape)}", f"must be {shape}", "See rollout.")
     fixes, speeds, start = _array(gnss, theta.dtype), _array(velocity, theta.dtype), _array(x0, theta.dtype)
-    spans = np.full(steps, dt, fixes.dtype) if isinstance(dt, float) else np.asarray(dt, dtype=fixes.dtype)
+    spans = np.asarray(dt, fixes.dtype)
     if spans.shape not in ((), (steps,)):
         raise InputError("dt", f"shape {spans.shape}", f"must be one number or ({steps},)", "Give s per step.")
-    return Drives(fixes, speeds, start, np.broadcast_to(spans, steps).copy() if spans.ndim == 0 else spans)
+    return Drives(fixes, speeds, start, np.broadcast_to(spans, steps).copy())
 
 
 def _array(tensor: Tensor, dtype: torch.dtype) -> AnyArray:

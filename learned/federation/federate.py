@@ -4,7 +4,7 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from coopoc.arrays import check_fields, instance, listed
 from coopoc.errors import InputError, shown
@@ -36,8 +36,8 @@ class Plan:
     rounds: int = 20
     aggregate: str | Rule | Combine = "mean"
     local_epochs: int = 5
-    schedule: Schedule = field(default_factory=Schedule)
-    participation: Participation = field(default_factory=Participation)
+    schedule: Schedule = Schedule()
+    participation: Participation = Participation()
 
     def __post_init__(self) -> None:
         check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
@@ -67,10 +67,10 @@ def federate(
     aggregate: str | Rule | Combine = "mean",
     local_epochs: int = 5,
     seed: int = 0,
-    schedule: Schedule | None = None,
+    schedule: Schedule = Schedule(),
     progress: str | None = None,
     *,
-    participation: Participation | None = None,
+    participation: Participation = Participation(),
 ) -> Federation:
     """Train one net on many clients: each adapts the global weights on its own pieces, the server combines the results.
 
@@ -108,9 +108,7 @@ def federate(
     start = chosen_net() if isinstance(chosen_net, type) else chosen_net
     if not isinstance(start, Gain):
         raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
-    optimiser = Schedule() if schedule is None else schedule
-    presence = Participation() if participation is None else participation
-    plan = Plan(rounds, aggregate, local_epochs, optimiser, presence)
+    plan = Plan(rounds, aggregate, local_epochs, schedule, participation)
     return federate_many([start], [clients], [seed], plan, progress)[0]
 
 
@@ -154,8 +152,7 @@ def federate_many(
     federations = []
     for history, team in zip(histories, teams, strict=True):
         most = chosen.tolerated(presence.count(len(team.names)))
-        federation = Federation(models[0], tuple(history), team.sizes, seconds, team.names, most)
-        federations.append(replace(federation, model=federation.after(federation.best.number)))
+        federations.append(Federation(models[0], tuple(history), team.sizes, seconds, team.names, most))
     return federations
 
 

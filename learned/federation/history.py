@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 from coopoc import InputError, Ledger
 from coopoc.arrays import instance
 from coopoc.evaluate.ledger import of_training
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 
 from ..nets.gain import Gain
 from ..nets.stack import unflatten
@@ -76,7 +77,7 @@ class Federation:
     """A federated net.
 
     Args:
-        model: net of the best round.
+        like: net of its shape.
         history: rounds, the start first.
         sizes: (C,) training pieces of each client.
         seconds: of training.
@@ -84,7 +85,7 @@ class Federation:
         tolerated: Byzantine clients of a round that the rule withstands.
     """
 
-    model: Gain
+    like: Gain
     history: tuple[Round, ...]
     sizes: tuple[int, ...]
     seconds: float
@@ -92,6 +93,11 @@ class Federation:
     tolerated: int = 0
 
     __repr__ = short_repr
+
+    @cached_property
+    def model(self) -> Gain:
+        """Net of the best round."""
+        return self.after(self.best.number)
 
     @property
     def card(self) -> dict[str, Any]:
@@ -137,7 +143,7 @@ class Federation:
         """The global net after round `number`, 0 being the start."""
         if not 0 <= number < len(self.history):
             raise InputError("round", number, f"must be in 0..{len(self.history) - 1}", "See history.")
-        return unflatten(self.history[number].weights[None], self.model)[0]
+        return unflatten(self.history[number].weights[None], self.like)[0]
 
 
 def _or_infinite(loss: float) -> float:

@@ -123,15 +123,13 @@ class Stack(NamedTuple):
         theta, members = self._rows(thetas)[rows], [self.members[row] for row in rows]
         seeds = [keys[row][1:] for row in rows]
         losses, stopped = adapt(theta, self.like, self.pool, members, seeds, number, rounds, local)
-        works = [Work({}, (), {}) for _ in self.teams]
+        works = []
         trained = {keys[row][::2]: at for at, row in enumerate(rows)}
         for i, team in enumerate(self.teams):
             here = {name: trained[i, name] for name in team.names if name in asked[i]}
-            works[i] = Work(
-                {name: theta[at] for name, at in here.items() if at not in stopped},
-                tuple(float(losses[here[name]]) if name in here else math.nan for name in team.names),
-                {name: stopped[at] for name, at in here.items() if at in stopped},
-            )
+            weights = {name: theta[at] for name, at in here.items() if at not in stopped}
+            own = tuple(float(losses[here[name]]) if name in here else math.nan for name in team.names)
+            works.append(Work(weights, own, {name: stopped[at] for name, at in here.items() if at in stopped}))
         return works
 
     def _rows(self, thetas: Sequence[Tensor]) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from coopoc.arrays import check_fields
 from coopoc.errors import InputError, shown
 from coopoc.plugins import find
 
@@ -42,12 +43,6 @@ class Rule:
     def __call__(self, theta: Tensor, weights: Tensor, sizes: Tensor) -> Tensor:
         """New weights (P,); theta (P,) is what the clients received."""
         return self.combine(weights, sizes)
-
-
-def within(field: str, value: object, good: bool, allowed: str) -> None:
-    """InputError for a parameter outside its range."""
-    if not good:
-        raise InputError(field, value, f"must be {allowed}", "The docstring cites its source.")
 
 
 @dataclass(frozen=True)
@@ -122,7 +117,7 @@ class TrimmedMean(Rule):
     share: float = 0.25
 
     def __post_init__(self) -> None:
-        within("share", self.share, 0 <= self.share < 0.5, "in [0, 0.5)")
+        check_fields(self, {"share": (0, math.nextafter(0.5, 0), "in [0, 0.5)")})
 
     @property
     def least(self) -> int:
@@ -185,9 +180,7 @@ class Krum(Rule):
     keep: int | None = 1
 
     def __post_init__(self) -> None:
-        whole = self.byzantine == int(self.byzantine) and self.byzantine >= 0
-        within("byzantine", self.byzantine, whole, "a whole number >= 0")
-        within("keep", self.keep, self.keep is None or self.keep >= 1, ">= 1 or None")
+        check_fields(self, {"byzantine": (0, 1e9, ">= 0"), "keep": (1, 1e9, ">= 1 or None")})
 
     @property
     def least(self) -> int:

@@ -17,7 +17,7 @@ from ..training.clients import Client
 from ..training.drives import drives_of
 from ..training.fit import Judge
 from ..training.machine import one_core
-from .job import job_of, local
+from .job import job_of
 
 if TYPE_CHECKING:
     from flwr.app import Context, Message, RecordDict
@@ -107,7 +107,8 @@ def answer(client: Client, job: Job, content: "RecordDict", training: bool) -> "
         metrics["validation-loss"] = float(Judge([[client.validation], [client.long]], model)(theta[None]))
         return made
     number: Any = config["server-round"]
-    weights, loss, failure = local_fit(model, theta, client, job.setting.seed, number, job.recipe.rounds, local(job))
+    plan = job.recipe.plan
+    weights, loss, failure = local_fit(model, theta, client, job.setting.seed, number, plan.rounds, plan.local)
     if failure:
         raise RuntimeError(failure)
     metrics["training-loss"] = loss

@@ -43,11 +43,6 @@ def job_of(config: Mapping[str, Any]) -> Job:
     return Job(name, recipe, Setting(**_of(Setting, settings)))
 
 
-def local(job: Job) -> Schedule:
-    """The schedule of a client's round."""
-    return replace(job.recipe.schedule, epochs=job.recipe.local_epochs, epoch="pass")
-
-
 def _words(text: str) -> dict[str, Any]:
     """The changes of a text such as "rounds=3 aggregate=median"."""
     allowed, settings = {field.name.replace("_", "-") for kind in (Recipe, Schedule) for field in fields(kind)}, {}

@@ -13,12 +13,10 @@ from torch import Tensor
 
 from coopoc import InputError, arrays
 from coopoc.arrays import one_of
-from coopoc.escapes import visible
-from coopoc.file_names import given_path
+from coopoc.text import given_path, visible
 
 from ..checkpoint import Checkpoint, read_card, save
 from ..federation.combine import SERVER, screen, too_few
-from ..federation.federate import Plan
 from ..federation.history import Federation, Round
 from ..federation.rules import rule
 from ..nets.gain import Gain
@@ -144,7 +142,7 @@ def rounds(
 
     (theta,) = flatten([untrained(job)])
     one_of("aggregate", job.recipe.aggregate, tuple(STRATEGIES))
-    Plan(aggregate=job.recipe.aggregate).check(nodes)
+    job.recipe.plan.check(nodes)
     named = {} if names is None else names
     strategy, until = _strategy(job.recipe.aggregate, theta, keep, named), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:
@@ -171,7 +169,7 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
 
         def aggregate_train(self, server_round: int, replies: "Iterable[Message]") -> tuple[Any, Any]:
             answers, rejected, note = read(replies, names, "training-loss")
-            weights = {name: _theta(reply) for name, reply in answers.items()}
+            weights = {name: _theta(reply.content["arrays"]) for name, reply in answers.items()}
             refused, self.usual = screen(self.row.weights, weights, self.usual)
             rejected |= refused
             good = {name: reply for name, reply in answers.items() if name not in rejected}
@@ -182,14 +180,13 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
             else:
                 combined, metrics = super().aggregate_train(server_round, list(good.values()))
             if combined is not None:
-                now = torch.from_numpy(combined["theta"].numpy().copy()).to(theta.dtype)
-            self.row = Row(server_round, now, losses, {}, {n: int(k) for n, k in pieces.items()}, rejected, note)
+                now = _theta(combined).to(theta.dtype)
+            self.row = Row(server_round, now, losses, {}, pieces, rejected, note)
             return combined, metrics
 
         def aggregate_evaluate(self, server_round: int, replies: "Iterable[Message]") -> Any:
             answers, rejected, _ = read(replies, names, "validation-loss")
-            losses, counts = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
-            pieces = {name: int(count) for name, count in counts.items()}
+            losses, pieces = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
             row = self.row._replace(validation_loss=losses, pieces=pieces, rejected=self.row.rejected | rejected)
             keep(row)
             return super().aggregate_evaluate(server_round, list(answers.values()))
@@ -239,7 +236,7 @@ def read(
         if pieces > most:
             metrics: Any = right[name].content["metrics"]
             metrics["num-examples"] = most
-            notes.append(f"{name} claims {pieces:.0f} pieces and counts with {most}")
+            notes.append(f"{name} claims {pieces} pieces and counts with {most}")
     return dict(sorted(right.items())), rejected, "; ".join(notes)
 
 
@@ -264,13 +261,12 @@ def _problem(content: Any, loss: str) -> str:
     return ""
 
 
-def _numbers(answers: "dict[str, Message]", name: str) -> dict[str, float]:
+def _numbers(answers: "dict[str, Message]", name: str) -> dict[str, Any]:
     """A metric by client."""
-    return {client: float(reply.content["metrics"][name]) for client, reply in answers.items()}  # type: ignore[arg-type]
+    return {client: reply.content["metrics"][name] for client, reply in answers.items()}
 
 
-def _theta(reply: "Message") -> Tensor:
-    arrays: Any = reply.content["arrays"]
+def _theta(arrays: Any) -> Tensor:
     return torch.from_numpy(arrays["theta"].numpy().copy())
 
 
@@ -294,8 +290,7 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
                 row.note,
             )
         )
-    made = Federation(untrained(job), tuple(history), tuple(sizes[name] for name in names), seconds, tuple(names))
-    return replace(made, model=made.after(made.best.number))
+    return Federation(untrained(job), tuple(history), tuple(sizes[name] for name in names), seconds, tuple(names))
 
 
 def checkpoint(rows: Sequence[Row], job: Job, seconds: float) -> Checkpoint:

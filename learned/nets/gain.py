@@ -18,15 +18,16 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from coopoc import Method
-from coopoc.arrays import Floats, Ints, number
+from coopoc.arrays import Floats, number
 
+from ..engine.optimiser import Moments, Outcome, Update, advance
 from ..method import LearnedGain
 from ..training.clients import Batch, Segments
-from ..training.schedule import Moving, Schedule, advance
 from .stack import named
 
 
@@ -61,21 +62,12 @@ class Gain(nn.Module, ABC):
             (gradient,) = torch.autograd.grad(means.sum(), leaf)
         return means.detach(), gradient
 
-    def descend(
-        self, moving: Moving, rows: Ints, batch: Batch, step: int, rates: Floats, schedule: Schedule
-    ) -> tuple[Tensor, Tensor]:
-        """One optimiser step (`schedule.advance`) in place: losses (R,) of the rows, and whether each was taken.
-
-        Args:
-            moving: weights and moments (S, P).
-            rows: (R,) models to move.
-            batch: the segments of these R models.
-            step: number of the step, >= 1.
-            rates: (R,) learning rates.
-            schedule: decay, clipping.
-        """
-        losses, gradient = self.loss_and_gradient(moving.theta[rows], batch)
-        return losses, advance(moving, gradient, losses, rows, step, rates, schedule)
+    def descend(self, moments: Moments, batch: Batch, update: Update) -> Outcome:
+        """One optimiser step in place of the rows (R,) of weights and moments, by their segments in a batch."""
+        losses, gradient = self.loss_and_gradient(torch.from_numpy(moments.theta[update.rows]), batch)
+        outcome = Outcome(gradient.numpy(), losses.numpy(), np.empty(len(losses), np.bool_))
+        advance(moments, outcome, update)
+        return outcome
 
 
 class Recurrent(Gain):

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, Ints, number, seed_of
+from coopoc.arrays import number, seed_of
 
 from ..engine import rollout as engine
 from ..engine.layers import CELLS, SHORTEST, SIZE
+from ..engine.optimiser import Moments, Outcome, Update
 from ..training.clients import Batch
-from ..training.schedule import Moving, Schedule
 from .gain import Recurrent, size
 
 
@@ -85,11 +85,9 @@ class GainNet(Recurrent):
         """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
         return engine.loss_and_gradient(theta, self.shapes, batch)
 
-    def descend(
-        self, moving: Moving, rows: Ints, batch: Batch, step: int, rates: Floats, schedule: Schedule
-    ) -> tuple[Tensor, Tensor]:
+    def descend(self, moments: Moments, batch: Batch, update: Update) -> Outcome:
         """One optimiser step as in `Gain`; each model goes from rollout to new weights before the next one begins."""
-        return engine.descend(moving, rows, self.shapes, batch, step, rates, schedule)
+        return engine.descend(moments, self.shapes, batch, update)
 
     def start(self, x0: Tensor) -> Memory:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""

@@ -18,7 +18,7 @@ from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
 from coopoc.methods.track import Alone
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.recording import Vehicles, check_recording
 
 from ..training.clients import Batch, Segments

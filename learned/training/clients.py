@@ -12,7 +12,7 @@ from torch import Tensor
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.arrays import AnyArray, Floats, check_fields, instance, number, one_of
 from coopoc.errors import shown
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 Start = Literal["gnss", "true"]
@@ -73,22 +73,15 @@ class Segments:
     def batch(self, index: Tensor) -> Batch:
         """Segments `index` (S, B)."""
         drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
-        x0, exact = drives[0, 0], None
-        if self._any_true_start:
-            exact = self.true_start[index]
-            x0, exact = torch.where(exact[..., None], drives[2, 0], x0), exact if exact.any() else None
+        exact = self.true_start[index]
+        x0 = torch.where(exact[..., None], drives[2, 0], drives[0, 0])
         gnss, velocity, truth = drives[:, 1:].unbind()
-        return Batch(gnss, velocity, truth, x0, self.dt, exact)
+        return Batch(gnss, velocity, truth, x0, self.dt, exact if exact.any() else None)
 
     @cached_property
     def _drives(self) -> AnyArray:
         """gnss, velocity and truth (3, T + 1, n, 3) with time first, as a batch has it."""
         return np.ascontiguousarray(np.stack([self.gnss, self.velocity, self.truth]).swapaxes(1, 2))
-
-    @cached_property
-    def _any_true_start(self) -> bool:
-        """Whether any piece starts at the truth."""
-        return bool(self.true_start.any())
 
     def take(self, index: Sequence[int]) -> "Segments":
         """The pieces `index`."""

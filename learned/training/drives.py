@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc.arrays import instance, listed
 from coopoc.errors import InputError, shown
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.fleet import Fleet, columns
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.storage import digest

@@ -3,8 +3,8 @@
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -12,14 +12,15 @@ from torch import Tensor
 
 from coopoc import InputError
 from coopoc.arrays import Floats, Ints, check_fields, instance
-from coopoc.short_repr import short_repr
+from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
+from ..engine.optimiser import Moments, Update
 from ..nets.gain import Gain
 from ..nets.stack import flatten, unflatten
 from .clients import Batch, Segments, mirrored
 from .machine import one_core, watched
-from .schedule import Moving, Schedule, cosine, generator
+from .schedule import Schedule, cosine, generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +53,19 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A trained net: the weights that validated best, how it went, why it stopped early (None: it did not), seconds."""
+    """A trained net: a net of its shape, how it went, why it stopped early (None: it did not), seconds."""
 
-    model: Gain
+    like: Gain
     history: tuple[Progress, ...]
     stopped: str | None
     seconds: float
 
     __repr__ = short_repr
+
+    @cached_property
+    def model(self) -> Gain:
+        """The net with the weights that validated best."""
+        return unflatten(self.best.weights[None], self.like)[0]
 
     @property
     def best(self) -> Progress:
@@ -71,7 +77,7 @@ def fit(
     model: Gain,
     training: Segments,
     validation: Segments,
-    schedule: Schedule | None = None,
+    schedule: Schedule = Schedule(),
     seed: int = 0,
     progress: str | None = None,
     long: Segments | None = None,
@@ -101,13 +107,13 @@ def fit(
 
 
 @one_core()
-def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: str | None = None) -> list[Fit]:
+def fit_many(tasks: Sequence[Task], schedule: Schedule = Schedule(), progress: str | None = None) -> list[Fit]:
     """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding.
 
     Raises:
         InputError: some of the tasks have long pieces and some have none.
     """
-    schedule = Schedule() if schedule is None else instance("schedule", schedule, Schedule)
+    instance("schedule", schedule, Schedule)
     began = time.perf_counter()
     like, theta = tasks[0].model, flatten([t.model for t in tasks])
     pool, members = pooled([t.training for t in tasks])
@@ -118,8 +124,7 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
         actual = f"with {len(long)} of {len(tasks)} tasks"
         raise InputError("long", actual, "must be given with all tasks or with none", "Train them apart.")
     judge = Judge([[t.validation for t in tasks], *([long] if long else [])], like)
-    best, lowest = theta.clone(), judge(theta)
-    history = [[Progress(0, w.clone(), math.nan, float(low))] for w, low in zip(theta, lowest, strict=True)]
+    history = [[Progress(0, w.clone(), math.nan, float(loss))] for w, loss in zip(theta, judge(theta), strict=True)]
     stopped: dict[int, str] = {}
     so_far: list[Tensor] = []
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
@@ -134,13 +139,10 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
             for row in checked:
                 mean = torch.stack([one[row] for one in so_far[history[row][-1].step :]]).mean()
                 history[row].append(Progress(step, theta[row].clone(), float(mean), float(validated[row])))
-                if validated[row] < lowest[row]:
-                    best[row], lowest[row] = theta[row], validated[row]
-    for row in torch.nonzero(lowest.isinf()).flatten().tolist():
-        stopped.setdefault(row, "no weights had a finite validation loss; start from GainNet(start_gain=0.1)")
     seconds = (time.perf_counter() - began) / len(tasks)
-    models = unflatten(best, like)
-    return [Fit(m, tuple(h), stopped.get(i), seconds) for i, (m, h) in enumerate(zip(models, history, strict=True))]
+    fits = [Fit(like, tuple(rows), stopped.get(i), seconds) for i, rows in enumerate(history)]
+    reason = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
+    return [fit if fit.stopped or fit.best.validation_loss < math.inf else replace(fit, stopped=reason) for fit in fits]
 
 
 def descend(
@@ -158,7 +160,8 @@ def descend(
     A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
     models with shorter plans wait for the longest. Their loss is NaN.
     """
-    moving = Moving(theta, torch.zeros_like(theta), torch.zeros_like(theta))
+    weights = theta.numpy()
+    moments = Moments(weights, np.zeros_like(weights), np.zeros_like(weights))
     for step in range(max(map(len, plans))):
         rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
         losses = np.full(len(plans), math.nan, np.float32)
@@ -167,10 +170,12 @@ def descend(
             batch = pool.batch(torch.from_numpy(np.array([plans[r][step] for r in rows])))
             batch = mirrored(batch, dice) if schedule.mirror else batch
             rate = np.array([rates[r][step] for r in rows])
-            losses[rows], taken = like.descend(moving, np.array(rows), batch, step + 1, rate, schedule)
+            update = Update(np.array(rows), step + 1, rate, schedule.weight_decay, schedule.clip)
+            outcome = like.descend(moments, batch, update)
+            losses[rows] = outcome.losses
             stopped |= {
                 r: f"loss or gradient not finite at step {step + 1}"
-                for r, good in zip(rows, taken.tolist(), strict=True)
+                for r, good in zip(rows, outcome.finite, strict=True)
                 if not good
             }
         yield step + 1, torch.from_numpy(losses)

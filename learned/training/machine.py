@@ -13,7 +13,8 @@ from coopoc.errors import InputError, shown
 from coopoc.workers import progress_bar
 
 Item = TypeVar("Item")
-_line: ContextVar[int] = ContextVar("line", default=0)
+LINE: ContextVar[int] = ContextVar("line", default=0)
+"""Of the terminal, for bars: processes side by side do not draw over each other."""
 
 
 @contextmanager
@@ -46,18 +47,8 @@ def _keep_freed_memory() -> None:
         mallopt(trim_threshold, most)
 
 
-@contextmanager
-def reporting_on(line: int) -> Iterator[None]:
-    """Draw bars on this line of the terminal, so that processes side by side do not draw over each other."""
-    token = _line.set(line)
-    try:
-        yield
-    finally:
-        _line.reset(token)
-
-
 def watched(items: Iterable[Item], name: str | None, unit: str, total: int | None = None) -> Iterator[Item]:
     """The items, with a bar of that name on stderr; None: without."""
     if not isinstance(name, str | None):
         raise InputError("progress", shown(name), "must be the name of a stage", "Give None for no bar.")
-    return iter(progress_bar(items, desc=name, unit=unit, total=total, disable=name is None, position=_line.get()))
+    return iter(progress_bar(items, desc=name, unit=unit, total=total, disable=name is None, position=LINE.get()))

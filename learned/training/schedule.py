@@ -1,17 +1,13 @@
-"""Schedule: how a net is optimised; plans of batches; the optimiser of many models at once."""
+"""Schedule: how a net is optimised; plans of batches and rates."""
 
 import sys
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from coopoc.arrays import Floats, Ints, Limits, check_fields
-
-from ..engine.optimiser import Moments, Outcome, Update
-from ..engine.optimiser import advance as advanced
 
 Epoch = Literal["step", "pass"]
 STEPS, SIZE = (1, 10**7, "> 0 and at most 10^7"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
@@ -58,14 +54,6 @@ class Schedule:
         return order[: steps * self.batch].reshape(steps, self.batch)
 
 
-class Moving(NamedTuple):
-    """State of the optimiser for S models in rows (S, P): weights, mean gradient, mean square."""
-
-    theta: Tensor
-    first: Tensor
-    second: Tensor
-
-
 def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
     """(steps,) factors (1 + cos(pi s)) / 2 of the learning rate, s running from start to stop of the training.
 
@@ -74,36 +62,6 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
     """
     where = start + (stop - start) * np.arange(steps) / max(steps, 1)
     return 0.5 * (1.0 + np.cos(np.pi * where))
-
-
-def advance(
-    moving: Moving, gradient: Tensor, losses: Tensor, rows: Ints, step: int, rates: Floats, schedule: Schedule
-) -> Tensor:
-    """One optimiser step in place for `rows` of the weights and moments; whether each was taken, (R,) booleans.
-
-    The gradient is clipped and AdamW (beta 0.9, 0.999) moves the weights; a row whose loss or gradient is not finite
-    does not change.
-
-    Args:
-        moving: weights and moments (S, P).
-        gradient: (R, P).
-        losses: (R,).
-        rows: (R,) models to move.
-        step: number of the step, >= 1.
-        rates: (R,) learning rates.
-        schedule: decay, clipping.
-
-    References:
-        Loshchilov and Hutter, ICLR 2019, algorithm 2.
-    """
-    outcome = Outcome(gradient.numpy(), losses.numpy(), np.empty(len(rows), np.bool_))
-    advanced(Moments(*(a.numpy() for a in moving)), outcome, update_of(rows, step, rates, schedule))
-    return torch.from_numpy(outcome.finite)
-
-
-def update_of(rows: Ints, step: int, rates: Floats, schedule: Schedule) -> Update:
-    """The step as the compiled optimiser takes it."""
-    return Update(rows, step, rates, float(schedule.weight_decay), float(schedule.clip))
 
 
 def generator(draw: np.random.Generator) -> torch.Generator:

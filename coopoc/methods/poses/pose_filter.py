@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints, check_fields, checked, number
 from ...errors import InputError
 from ...kernels.compiling.waiting import clock
-from ...short_repr import short_repr
+from ...text import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
 from ...world.plausible import radians

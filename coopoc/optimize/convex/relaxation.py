@@ -16,7 +16,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError, require, said
-from ...short_repr import short_repr
+from ...text import short_repr
 from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve

@@ -11,8 +11,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, instance, number, one_of
 from ...errors import InputError, unknown
-from ...one_file import in_file
-from ...plugins import find, names
+from ...plugins import find, in_file, names
 from ...world.links import spherical as to_spherical
 from .space import Space
 
