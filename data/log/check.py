@@ -14,6 +14,8 @@ from coopoc.workers import progress_bar
 
 from .estimates import (
     ALIKE,
+    BEHIND,
+    BESIDE,
     DRIFT,
     ENOUGH,
     FAST,
@@ -57,6 +59,8 @@ CONFIDENT = 3.0
 """Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
 UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
+EXPECTED = "steps of", "fixes and relative measurements that hold"
+"""Beginnings of what is left out as it should be."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
     "repeated rows": "Do stamps lack their fraction, as stamp.sec without nanosec, or do two vehicles share a name?",
@@ -124,8 +128,10 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
             "fixes_per_odometry": None if ratio is None else abs(ratio),
             "turned_deg": None if ratio is None else float(np.angle(ratio, deg=True)),
             **_with_error("speed_excess", wheels, 0),
+            **_with_error("beside_east", wheels, 3),
+            **_with_error("beside_north", wheels, 4),
             **_with_error("turned" if c.log.recording.body is None else "yaw_rate_bias", wheels, 1),
-            **(_with_error("late_s", wheels, 2) if truth is not None else {}),
+            **_with_error("fixes_late_s" if truth is None else "late_s", wheels, 2),
             "clock_s": float(c.ahead[column]) if np.isfinite(c.unsure[column]) else None,
             "std_m": _rms(np.sqrt(c.variance[:, column])),
         }
@@ -154,9 +160,13 @@ def _axes(c: Check, column: int) -> str:
     """What is wrong with the axes of velocities that explain the fixes once they are mirrored, or whose direction never
     changes while that of the fixes does; nothing where they agree."""
     rec = c.world
-    moved, driven = moves(c, column)
+    moved, driven, *_ = moves(c, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
     u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
+    height, climbed = rec.gnss[0, :, column, 2], np.cumsum(np.nan_to_num(rec.velocity[0, :, column, 2])) * rec.dt
+    up, climbed = (each[np.isfinite(height)] for each in (height, climbed))
+    if len(up) > ENOUGH and np.ptp(climbed) > 4 * rec.sensors.fix_std[2] and np.corrcoef(up, climbed)[0, 1] < -0.9:
+        return "heights of fixes fall where vz is positive: it counts upwards, so that scale=vz:-1 mends it."
     if not size or abs(np.vdot(driven, moved)) > ALIKE * size:
         return ""
     mirror = np.vdot(driven.conj(), moved)
@@ -177,8 +187,8 @@ def _axes(c: Check, column: int) -> str:
 def _of_rows(c: Check) -> list[str]:
     """Measurements and columns that were left out."""
     summary, sentences = c.log.summary, []
-    left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith("steps of")}
-    share = sum(left.values()) / max(sum(left.values()) + sum(summary.read.values()), 1)
+    left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith(EXPECTED)}
+    share = sum(left.values()) / max(summary.rows, 1)
     held = left.get(HOLDS, 0) > FEW
     if share > UNUSED or held:
         why = HOLDS if held else max(left, key=lambda reason: left[reason])
@@ -230,6 +240,20 @@ def _of_vehicles(c: Check) -> list[str]:
         sentences += [f"{name}: {axes}"] * bool(axes)
         if axes or name in c.log.summary.assumed.get(CLOCKWISE, ()):
             continue
+        if _beyond(row, "fixes_late_s", BEHIND):
+            sentences.append(
+                f"{name}: its fixes are {abs(row['fixes_late_s']):.2f} +- {row['fixes_late_s_error']:.2f} s "
+                f"{'behind' if row['fixes_late_s'] > 0 else 'ahead of'} its odometry: clocks differ, or the receiver "
+                "smooths them. It cannot be said yet whether the odometry errs."
+            )
+        east, north = row.get("beside_east", 0.0), row.get("beside_north", 0.0)
+        unsure = np.hypot(row.get("beside_east_error", 0.0), row.get("beside_north_error", 0.0))
+        if np.hypot(east, north) > max(BESIDE, SURELY * unsure):
+            sentences.append(
+                f"{name}: it moves by {np.hypot(east, north):.2f} +- {unsure:.2f} m/s towards "
+                f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
+                "current, a ferry; or fixes that drift."
+            )
         if distance is not None and not 0.8 <= distance <= 1.25:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
             sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
@@ -248,7 +272,8 @@ def _of_vehicles(c: Check) -> list[str]:
         if turn is not None and abs(turn) <= 20 and _beyond(row, "turned", TURNED):
             sentences.append(
                 f"{name}: its odometry is turned by {np.rad2deg(row['turned']):.2f} +- "
-                f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, or the mounting of a sensor."
+                f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, the mounting of a sensor, "
+                "or, on a bend at one speed, a clock."
             )
         if turn is not None and abs(turn) > 20:
             sentences.append(
@@ -341,7 +366,7 @@ def _of_fixes(c: Check) -> list[str]:
                 "they else follow: clocks differ, as by leap seconds, or files of two drives."
             )
             continue
-        if c.ahead[column] or _late(c, row):
+        if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND):
             continue
         derived = truth is None and rec.sensors.velocity_reading == "fixes"
         derived |= truth is None and _off(row)  # what draws positions aside draws them along a bend, too

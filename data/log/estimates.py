@@ -19,6 +19,8 @@ SURELY = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
 LATE, SCALE, TURNED, DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
+BESIDE, BEHIND = 0.1, 0.5
+"""m/s, least velocity beside that of the odometry that is reported, and s, least lag of fixes behind it."""
 UNITS_APART = 0.2
 """Share by which lengths are off from which their unit is wrong."""
 ENOUGH = 20
@@ -27,6 +29,8 @@ FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ALIKE = 0.97
 """Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
+ALONE = 0.02
+"""Share of a cause, squared, that no others may make up, so that it can be told from them."""
 OUTLYING, BLOCKS = 5.0, 10
 """Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
 FAST = 2.0
@@ -125,9 +129,10 @@ def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     return np.asarray(of_step.take(at, axis))
 
 
-def moves(c: Check, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
-    """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
-    that stands still, the fixes) moves far; none where too little moves. On a short way the means of several
+def moves(c: Check, column: int, means: int = 1) -> AnyArray:
+    """(5, M) displacements m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
+    that stands still, the fixes) moves far; by what velocity and acceleration change over a span, as fixes are off that
+    are late, or smoothed; and how long it is, s. M = 0 where too little moves. On a short way the means of several
     fixes are less noisy."""
     rec = c.world
     fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
@@ -136,7 +141,9 @@ def moves(c: Check, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
     at = np.flatnonzero(np.isfinite(fixes))
     parts = at[: len(at) // means * means].reshape(-1, means)
     parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
-    fixes, path, gaps = fixes[parts].mean(axis=1), path[parts].mean(axis=1), gaps[parts[:, 0]]
+    pace = np.gradient(path, rec.dt)
+    numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(axis=2)
+    (fixes, path), gaps = numbers[:2], gaps[parts[:, 0]]
     times = FAR if means == 1 else FAR / 3
     for places, far in ((path, times), (fixes, 2 * times)):
         pairs, last = [], 0
@@ -150,25 +157,27 @@ def moves(c: Check, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
                 pairs.append((last, k))
                 last = k
         if len(pairs) >= 3:
-            a, b = np.array(pairs).T
-            return fixes[b] - fixes[a], path[b] - path[a]
-    return np.empty(0), np.empty(0)
+            return np.diff(numbers[:, np.array(pairs)], axis=2)[..., 0]
+    return np.empty((5, 0))
 
 
 def ratio_of_moves(c: Check, column: int) -> complex | None:
     """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
-    moved, driven = moves(c, column)
+    moved, driven, *_ = moves(c, column)
     ratio: complex = np.vdot(driven, moved) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
     most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - ALIKE**2) ** 0.5 * np.linalg.norm(moved))
     return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
 
 
 def odometry(c: Check, column: int) -> Estimate:
-    """By what share a vehicle's speeds are too large, and by what its directions are turned, rad; in body frames what
-    its yaw rates are too large by, rad/s; and by what it is later than a truth, s: against the truth, else the fixes,
-    in body frames else the filter."""
+    """Errors of a vehicle's odometry against the truth, else the fixes, in body frames else the filter.
+
+    By what share speeds are too large; by what directions are turned, rad, or in body frames yaw rates too large,
+    rad/s; by what it is later than a truth, or fixes later than it, s; with which velocity the vehicle moves beside it,
+    m/s east and north.
+    """
     rec, truth, body = c.world, c.log.truth, c.log.recording.body
-    none = Estimate(np.zeros(3), np.full(3, np.inf))
+    none = Estimate(np.zeros(5), np.full(5, np.inf))
     if rec.sensors.velocity_reading == "fixes":
         return none
     velocity = rec.velocity[0, :, column, :2]
@@ -176,17 +185,25 @@ def odometry(c: Check, column: int) -> Estimate:
     if truth is None and body is not None:
         value, error = c.lasting[:, column]
         attenuation = np.square(noise).sum() / max(np.nansum(np.square(velocity)), 1e-12)
-        return Estimate(value, np.hypot(error, [attenuation, 0.0]))
+        value, error = np.append(value, none.value[2:]), np.append(error, none.error[2:])
+        return Estimate(value, np.hypot(error, [attenuation, 0.0, 0.0, 0.0, 0.0]))
     if truth is None:
-        moved, driven = moves(c, column)
+        moved, driven, turns, bends, span = moves(c, column)
         if len(moved) < ENOUGH:
             means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * ENOUGH // 2)
-            moved, driven = moves(c, column, max(means, 2))
+            moved, driven, turns, bends, span = moves(c, column, max(means, 2))
         square = max(np.square(np.abs(driven)).sum(), 1e-12)
-        value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * c.fix_noise)
+        causes = np.stack([driven, 1j * driven, turns, bends])
+        value, error = _of_motion(moved - driven, causes, span, 2**0.5 * c.fix_noise)
         attenuation = (np.linalg.norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
-        turned = (1 + complex(*value)) * (1 + attenuation)
-        return Estimate(_polar(1 / turned), np.hypot(error, attenuation) / abs(turned) ** 2) if turned else none
+        turned = (1 + complex(*value[:2])) * (1 + attenuation)
+        if not turned:
+            return none
+        value[:2], value[2] = _polar(1 / turned), -value[2]
+        error[:2] = np.hypot(error[:2], attenuation) / abs(turned) ** 2
+        if abs(value[2]) > max(BEHIND, SURELY * error[2]):  # smoothed fixes cut bends: speeds and directions seem wrong
+            error[[0, 1, 3, 4]] = np.inf
+        return Estimate(value, error)
     path = plane(truth.position[:, column])
     true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]
@@ -194,18 +211,41 @@ def odometry(c: Check, column: int) -> Estimate:
         odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
         heading = None if truth.heading is None else truth.heading[:, column]
         true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
-    x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
-    used = np.isfinite(odometer + x.sum(axis=1))
+    x = np.stack([true, 1j * true, np.gradient(true, rec.dt)])
+    used = np.isfinite(odometer + x.sum(axis=0))
     used &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
-    value, error = factors((odometer - true)[used], x[used], np.linalg.norm(noise) / len(noise) ** 0.5)
+    constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), np.linalg.norm(noise) / len(noise) ** 0.5
+    value, error = _of_motion((odometer - true)[used], x[:, used], constant, usual)
     late = -value[2] / max(1 + value[0], 0.1)
-    value = np.append(_polar(1 + complex(*value[:2])), late)
+    value[:3] = *_polar(1 + complex(*value[:2])), late
     error[2] = error[2] if abs(late) < FAST else np.inf  # what is linear in a lag holds for small ones
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
             gap = body.yaw_rate[0, 1:, column] - wrap(np.diff(truth.heading[:, column])) / rec.dt
             value[1], error[1] = median(gap[np.isfinite(gap)])
+    return Estimate(value, error)
+
+
+def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Estimate:
+    """Factors (5,) by which causes x (K, M), a size, a turn, a lag and what else may be, explain y (M,), and a constant
+    velocity that is made of `constant` (M,). What is within two standard errors is left out, the constant first, and
+    what looks like another cause, which make up all but ALONE of it, as a lag does on a bend at one speed."""
+    value, error = np.zeros(5), np.full(5, np.inf)
+    for causes, extra in ((np.concatenate([x, [constant, 1j * constant]]), [-2, -1]), (x, [2]), (x[:2], [])):
+        unit = np.concatenate([causes.real, causes.imag], axis=1)
+        unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+        alone = 1.0 / np.diag(np.linalg.inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
+        if extra and (alone < ALONE).any():
+            continue
+        found = factors(y, causes.T, noise)
+        if np.linalg.norm(found.value[extra]) >= 2.0 * np.linalg.norm(found.error[extra]):
+            break
+    of_causes = min(len(causes), 3)
+    for whole, part in zip((value, error), found, strict=True):
+        whole[:of_causes] = part[:of_causes]
+        if len(extra) == 2:
+            whole[3:] = part[extra]
     return Estimate(value, error)
 
 

@@ -1,5 +1,6 @@
 """Headings of a member of a log: as they were measured, or by its course, or by gyro, odometer and fixes."""
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -73,6 +74,20 @@ class Reckoning(NamedTuple):
         way = Signal(self.speed.t, self.speed.value * np.column_stack([np.cos(angle), np.sin(angle)]))
         return integral(way, self.fixes.t) @ [1, 1j], self.fixes.value[:, :2] @ [1, 1j]
 
+    def parts(self, gap: float) -> "list[Reckoning]":
+        """Between gaps of the yaw rate, which nothing leads across."""
+        t = self.yaw_rate.t
+        ends = np.concatenate([[-np.inf], (t[:-1] + 0.5 * gap)[np.diff(t) > gap + SAME], [t[-1] + 0.5 * gap]])
+
+        def within(signal: Signal, since: float, until: float) -> Signal:
+            inside = (signal.t > since) & (signal.t <= until)
+            return Signal(signal.t[inside], signal.value[inside])
+
+        parts = [
+            Reckoning(*(within(signal, *span) for signal in self[:3]), self.std) for span in itertools.pairwise(ends)
+        ]
+        return [part for part in parts if min(len(signal.t) for signal in part[:3]) > 1]
+
     def far_apart(self) -> Iterator[tuple[int, int, complex, complex]]:
         """Indices of fixes that are BASELINE standard deviations apart, and x + iy m by which they and dead reckoning
         moved in between."""
@@ -117,6 +132,24 @@ def heading_of_courses(velocity: Signal, yaw_rate: Signal | None) -> HeadingAt:
     east, north = velocity.value[:, :2].T
     offset = Signal(velocity.t, (np.arctan2(north, east) - _angle(yaw_rate, velocity.t))[:, None])
     return lambda at: wrap(held(offset, at)[:, 0] + _angle(yaw_rate, at))
+
+
+def heading_of_rates(way: Reckoning, gap: float) -> Course | None:
+    """`heading_of_gyro`, else `heading_of_all`, anew behind each gap of the yaw rate that is longer than `gap` s."""
+    found = [(part, heading_of_gyro(part) or heading_of_all(part)) for part in way.parts(gap)]
+    courses = [(part.yaw_rate.t, course) for part, course in found if course is not None]
+    if not courses:
+        return None
+
+    def at(times: Floats) -> Floats:
+        angle = unknown(times)
+        for t, course in courses:
+            here = (times >= t[0] - 0.5 * gap) & (times <= t[-1] + 0.5 * gap)
+            angle[here] = course.at(times[here])
+        return angle
+
+    longest = max(courses, key=lambda each: len(each[0]))[1]
+    return longest._replace(at=at)
 
 
 def heading_of_gyro(way: Reckoning) -> Course | None:

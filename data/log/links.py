@@ -6,18 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from coopoc import V2X, Links, Recording
+from coopoc import V2X, Links, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.world.links import spherical, wrap
 from coopoc.world.sensing import schedule
 
 from .motion import COURSE, Member, Steps, stacked
-from .units import Rows, Summary, in_group, only
+from .units import Rows, Summary, in_group, only, stated_std
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
 PAIR = ["step", "observer", "neighbour"]
-NEAR = 10.0
-"""Distances, over what the two move until the step, below which the direction is not known well enough."""
+NEAR, APART = 10.0, 4.0
+"""Distances, over what the two move until the step, and over the standard deviation of a fix, below both of which a
+direction is not known well enough."""
 RADAR = "{} ranges beside a direction count for who measured them alone: a radar's partner does not know them"
 TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both ends (else mutual=False)"
 
@@ -39,7 +40,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     """
     there = np.isfinite(stacked(members, "velocity")[..., 0])
     summary, sent = steps.summary, only(rows, "message")
-    measured = _measured(rows[in_group(rows, "relative")], members, there, steps)
+    measured = _measured(rows[in_group(rows, "relative")], rows, members, there, steps)
     if mutual:
         stands = np.array([member.stands for member in members.values()])
         far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
@@ -118,7 +119,7 @@ def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:
     return pd.Index(list(ids)).get_indexer(pd.Index(names)).astype(np.int64)
 
 
-def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:
+def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:
     """One of each step, observer, neighbour (columns of members) and component of a link, with its value: range m,
     azimuth (in body frames bearing) rad or inclination rad."""
     summary, body, value = steps.summary, steps.body, rows["value"].to_numpy(copy=True)
@@ -149,10 +150,13 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     summary.refuse(reason, table[again].sort_index())
     table = table[~again]
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
+    std = stated_std(fixes, "x", "y")
+    moved, vague = _to_step(table, members, steps, APART * (std if std > 0.0 else Sensors().gnss_std[0]))
+    summary.refuse("relative measurements off the steps, of what is too near", table[vague])
+    table = table.assign(value=moved)[~vague]
     for word, number in zip(words, np.bincount(table["component"], minlength=3).tolist(), strict=True):
         summary.count(word, number)
-    moved: pd.DataFrame = table.assign(value=_to_step(table, members, steps))
-    return moved[[*PAIR, "component", "value"]]
+    return table[[*PAIR, "component", "value"]]
 
 
 def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[pd.DataFrame, Bools]:
@@ -177,11 +181,12 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     return table.groupby(PAIR)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
-def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps) -> Floats:
+def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, std: float) -> tuple[Floats, Bools]:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
-    their velocities in the world. Nothing is moved where these are not known, or g or the range is not far longer than
-    lag du. In body frames a bearing grows by lag w, too, with the observer's yaw rate w.
+    their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR times lag du.
+    Nothing is moved where g or du is not known. In body frames a bearing grows by lag w, too, with the observer's yaw
+    rate w.
     """
     velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
@@ -203,6 +208,7 @@ def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps) -
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
     distance = np.where(component == 0, value, np.inf)
-    far = np.minimum(np.linalg.norm(now, axis=1), distance) > NEAR * np.linalg.norm(now - then, axis=1)
-    value = value + np.where(far, change[np.arange(len(change)), component], 0.0)
-    return np.where(component == 1, wrap(value), value)
+    gap, moved = np.minimum(np.linalg.norm(now, axis=1), distance), np.linalg.norm(now - then, axis=1)
+    vague = (gap <= NEAR * moved) & (gap <= std)
+    value = value + np.where(vague, 0.0, np.nan_to_num(change[np.arange(len(change)), component]))
+    return np.where(component == 1, wrap(value), value), vague

@@ -20,9 +20,8 @@ from .heading import (
     Signal,
     covered,
     heading_at,
-    heading_of_all,
     heading_of_courses,
-    heading_of_gyro,
+    heading_of_rates,
     integral,
     mirrored,
     unknown,
@@ -218,25 +217,30 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         moved, times, heading = _in_world(name, rows, measured, shown, way, steps)
         signals, rate = [times], none
         velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
-    there = np.ones(len(grid), dtype=bool)
-    for signal in signals:
-        interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
-        there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
-    gnss = _fixes_on_steps(rows, fixes, np.nan_to_num(moves), there, steps, again, way.std)
+    there, by_fixes = _present(signals, steps), signals[0] is fixes
+    held = _held(fixes, np.nan_to_num(moves), there, steps, again, way.std)
+    if held.any():
+        summary.refuse(HOLDS, only(rows, "x")[lambda rows: rows["t"].isin(fixes.t[held])])
+        fixes = Signal(*(values[~held] for values in fixes))
+        if by_fixes:
+            shown, signals = velocity_of_fixes(way._replace(fixes=fixes), steps), [fixes]
+            velocity = moves = _by_fixes(fixes, shown, steps)
+            there, heading = _present(signals, steps), heading._replace(wanders=shown.wanders)
+    gnss = _fixes_on_steps(rows, fixes, np.nan_to_num(moves), there, steps)
     fixed = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
     if fixed.any() or not body:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
         there &= fixed
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time{_longest(there, grid)}"
-    text = f"{len(fixes.t)} fixes, {len(signals[0].t) * (signals[0] is not fixes)} samples of odometry, "
+    text = f"{len(fixes.t)} fixes, {len(signals[0].t) * (not by_fixes)} samples of odometry, "
     text += f"{len(measured.t)} headings, {span}"
     absent, compass = np.where(there, 0.0, np.nan), none
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    alone = heading.wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
+    alone = heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2)
     velocity = velocity + absent[:, None]
-    climbs = 0.0 if steps.planar or signals[0] is fixes or rows["kind"].eq("vz").any() else climbing(fixes)
+    climbs = 0.0 if steps.planar or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate, compass, moves, alone, climbs)
 
@@ -309,7 +313,7 @@ def _heading(measured: Signal, world: Signal | None, shown: Shown, way: Reckonin
     rate = way.yaw_rate if len(way.yaw_rate.t) > 1 else None
     if len(measured.t):
         return Course(heading_at(measured, rate, steps.gap(measured.t)))
-    if rate is not None and len(way.speed.t) > 1 and (derived := heading_of_gyro(way) or heading_of_all(way)):
+    if rate is not None and len(way.speed.t) > 1 and (derived := heading_of_rates(way, steps.gap(rate.t))):
         return derived
     sources = [("fixes", shown)]
     if world is not None:
@@ -381,20 +385,28 @@ def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, 
     return kept, step[kept], lag[kept]
 
 
-def _fixes_on_steps(
-    rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bools, std: float
-) -> Floats:
-    """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time; none
-    that is as the one before (`again`), though what moves has gone on by its standard deviation."""
-    gnss, summary = np.full((len(steps.grid), 3), np.nan), steps.summary
+def _present(signals: Sequence[Signal], steps: Steps) -> Bools:
+    """(T,) whether all signals are there, or bridged."""
+    there = np.ones(len(steps.grid), dtype=bool)
+    for signal in signals:
+        interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
+        there &= covered(signal.t, steps.grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
+    return there
+
+
+def _held(fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bools, std: float) -> Bools:
+    """(M,) fixes that are as the one before (`again`), though what moves has gone on by their standard deviation."""
     nearest, _ = steps.nearest(fixes.t)
     moves = there & (np.linalg.norm(velocity, axis=1) > STANDS)
     way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
     before = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
-    held = again & there[nearest] & (np.linalg.norm(way - way[before], axis=1) > std)
-    rows = only(rows, "x")
-    summary.refuse(HOLDS, rows[rows["t"].isin(fixes.t[held])])
-    fixes, nearest = Signal(*(values[~held] for values in fixes)), nearest[~held]
+    return np.asarray(again & there[nearest] & (np.linalg.norm(way - way[before], axis=1) > std))
+
+
+def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps) -> Floats:
+    """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
+    gnss, summary, rows = np.full((len(steps.grid), 3), np.nan), steps.summary, only(rows, "x")
+    nearest, _ = steps.nearest(fixes.t)
     kept, step, lag = _nearest_of_each(fixes, there, steps)
     absent = (nearest >= 0) & ~there[nearest]
     beside = ~np.isin(np.arange(len(nearest)), kept) & (nearest >= 0) & ~absent

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from scipy.interpolate import Akima1DInterpolator
 
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Floats, checked, instance, named, number, one_of, refuse, texts
@@ -26,10 +27,11 @@ from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
+from .heading import covered
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
-from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, only, without_codes
+from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, not_vague, only, without_codes
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
@@ -52,6 +54,9 @@ READERS: Mapping[str, Callable[..., Rows]] = {
 entry."""
 TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 """Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
+COARSE = 0.5
+"""s between samples of a truth, from which lines between them are no way that was driven, and within which of one the
+curve through them is."""
 APART = 3600.0
 """s between the files of a folder, and longer than all of them together: they are of several drives."""
 
@@ -213,7 +218,8 @@ def read_log(
     _check_one_drive(rows, path)
     if origin is not None and not rows["kind"].isin([*ENU]).any():
         summary.assume("origin= has no effect: no fix is in degrees")
-    rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
+    summary.rows = int((rows["true"] == 0).sum())
+    rows, true_rows = not_vague(rows[rows["true"] == 0], summary), rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin, summary)
     deviations = factors(std, KINDS.keys() - {"message"}, "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
@@ -234,7 +240,7 @@ def read_log(
     if len(true_rows):
         true_rows = local(true_rows, origin, summary)[0]
         true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
-        fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
+        fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem, summary)
         for name, share in zip(ids, np.isfinite(fleet.position[..., 0]).mean(axis=0), strict=True):
             summary.vehicles[name] += f", truth {share:.0%}"
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
@@ -450,7 +456,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     return float(t.min()) + step * np.arange(int(span / step + 1.5))
 
 
-def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:
+def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, summary: Summary) -> Fleet:
     """Truth of the members that have one, on the steps of the recording; a file that names none is that of the only
     one."""
     ids, start, vehicles = recording.ids, recording.t[0], sorted(rows["vehicle"].unique())
@@ -466,6 +472,10 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
     if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
         rows = rows.assign(t=rows["t"] + DAY * round((recording.t.mean() - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
+    heights = pd.DataFrame(recording.gnss[0, ..., 2])
+    heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")
+    if axes == 2 and heights.abs().max(axis=None) > 0.0:
+        summary.assume("the truth has no heights: means of the fixes' over 20 s stand for them, and for their errors")
     poses = np.full((len(recording.t), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
         own_rows = rows[rows["vehicle"] == vehicle]
@@ -476,6 +486,12 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
             if len(t) > 1:
                 gap = longest_gap(t, recording.dt, max_gap)
                 out[:] = interpolate(t - start, value, recording.t - start, gap)
+                if np.median(np.diff(t)) > COARSE and len(t) > 2:
+                    summary.assume(
+                        f"a truth that is seldom counts within {COARSE:g} s, on a curve through all (Akima's)"
+                    )
+                    near = covered(t, recording.t, 0.0, COARSE)[:, None] & np.isfinite(out)
+                    out[:] = np.where(near, Akima1DInterpolator(t - start, value)(recording.t - start), np.nan)
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
@@ -486,6 +502,8 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
             f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s",
             "Does its clock or its date differ?",
         )
+    if axes == 2:
+        position[..., 2] = heights.fillna(0.0).where(np.isfinite(position[..., 0]))
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
     velocity = backward_difference(recording.t, position, ids)

@@ -104,7 +104,10 @@ def of_measurements(c: Check) -> list[str]:
             ratios = measured[far] / np.maximum(true[far], 1e-3)
             ratio = np.median(ratios) if len(ratios) >= ENOUGH else 1.0
             wrong |= (other := not 0.8 <= ratio <= 1.25)
-            if scaled := other and robust_std(ratios) < 0.2 * ratio:
+            varied = robust_std(true[far]) > 0.2 * np.median(true[far]) if len(ratios) else False
+            powers = np.log10([ratio, 0.3048 * ratio])
+            usual = np.abs(powers - np.round(powers)).min() < 0.02
+            if scaled := other and (varied or usual) and robust_std(ratios) < 0.2 * ratio:
                 power = round(np.log10(ratio))
                 unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
                 unit_text = f"scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."

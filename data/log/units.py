@@ -55,6 +55,9 @@ LEAST = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 CODES, APART, FEW = 3, 1.4, 10
 """Most numbers of a kind that stand for none, and times the largest that can be meant beyond which they are; least rows
 of one that could be meant, and times the usual step from one range of a pair to the next that is a leap."""
+VAGUE = 30.0
+"""Times the usual standard deviation of a kind, from which the largest, if it repeats, says that there was no
+measurement; squared, also if it does not."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
 UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
@@ -111,7 +114,7 @@ def place(rows: Rows) -> str:
 
 def without_codes(rows: Rows, summary: "Summary") -> Rows:
     """Rows but those whose number says that there was no measurement, as -1, 0 or 65.535 among ranges: one of few, each
-    in several rows, that are far from what can be meant, or to and from which ranges leap."""
+    in several rows, that are far from what can be meant, or to and from which ranges and speeds leap."""
     own = rows[in_group(rows, "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
     size, limit = value.abs(), kind.map(LIMITS)
@@ -121,13 +124,26 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     codes = own[wrong & ~kind.isin(kind[near])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
-    ranges = own[(kind == "range") & ~own.index.isin(lost.index)]
-    ranges = ranges.sort_values(["vehicle", "partner", "t"], kind="stable")
-    for number in {*ranges["value"].mode()[:1], ranges["value"].max()}:
-        lost = pd.concat([lost, ranges[_leaps(ranges, number)]])
+    for name in ("range", "speed", "speed_kmh"):
+        values = own[(kind == name) & ~own.index.isin(lost.index)]
+        values = values.sort_values(["vehicle", "partner", "t"], kind="stable")
+        usual = values["value"].mode()[:1] if name == "range" else ()  # a car may stand, often
+        for number in {*usual, values["value"].max()}:
+            lost = pd.concat([lost, values[_leaps(values, number)]])
     for (name, number), same in lost.groupby(["kind", "value"]):
         summary.refuse(f"{name} of {number:g}, which stands for none", same)
     return rows.drop(lost.index.unique())
+
+
+def not_vague(rows: Rows, summary: "Summary") -> Rows:
+    """Rows but those whose standard deviation says that there was no measurement: the largest of a kind, far beyond
+    the usual of the vehicle."""
+    std = rows["std"]
+    ratio = std / std.groupby([rows["vehicle"], rows["kind"]]).transform("median")
+    vague = std[(ratio > VAGUE) & std.eq(std.groupby(rows["kind"]).transform("max"))]
+    vague = vague[vague.map(vague.value_counts()).gt(1) | (ratio[vague.index] > VAGUE**2)]
+    summary.refuse("measurements whose standard deviation says that there is none", rows.loc[vague.index])
+    return rows.drop(vague.index)
 
 
 def _leaps(ranges: Rows, number: float) -> Bools:
@@ -205,6 +221,7 @@ class Summary:
         refused: reason -> (number, place of the first) of measurements that are not in it.
         unused: what was never meant to be read -> number of cells.
         odometry: s, from one sample of it to the next, 0 where there is none.
+        rows: how many numbers were logged.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
 
     >>> summary = Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3})
@@ -226,6 +243,7 @@ class Summary:
     refused: dict[str, tuple[int, str]] = field(default_factory=dict)
     unused: dict[str, int] = field(default_factory=dict)
     odometry: float = 0.0
+    rows: int = 0
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
     def count(self, what: str, number: int) -> None:
