@@ -201,7 +201,7 @@ def read_log(
     for one, other in (ends, ends[::-1]):
         pair = one + "-" + other
         key = key.mask((rows["kind"] == "range") & pair.isin(list(offset)), pair)
-    less = key.map(factors(offset, {*KINDS, *key}, "offset")).fillna(0.0)
+    less = key.map(factors(offset, dict.fromkeys((*KINDS, *key)), "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = without_codes(unwrapped(rows, summary), summary)
@@ -216,7 +216,7 @@ def read_log(
         summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin, summary)
-    deviations = factors(std, KINDS.keys() - {"message"}, "std")
+    deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
     if not any_scale:
