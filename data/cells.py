@@ -103,16 +103,10 @@ def headers(path: Path) -> list[str]:
         return []
 
 
-def numeric(frame: "pd.DataFrame", column: str, file: str, given: Bools | None = None) -> Floats:
-    """A column as finite numbers, NaN where not `given` (default: everywhere); InputError with the row of the first
-    cell that is none."""
+def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
+    """A column as finite numbers; InputError with the row of the first cell that is none."""
     import pandas as pd
 
-    if given is not None:
-        out = np.full(len(frame), np.nan)
-        if given.any():
-            out[given] = numeric(frame[given], column, file)
-        return out
     cells = frame[column]
     if cells.dtype.kind in "bmM":
         raise InputError(

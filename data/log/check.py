@@ -210,7 +210,8 @@ def _of_vehicles(c: Check) -> list[str]:
     for row in c.vehicles:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
         column = c.world.ids.index(name)
-        square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
+        there = np.isfinite(c.normalised[:, column])
+        square = size * c.normalised[there, column]
         usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
         outliers = np.mean(square > OUTLYING**2 * usual) if len(square) else 0.0
         if outliers > max(OUTLIERS, SEVERAL / max(len(square), 1)):
@@ -220,7 +221,7 @@ def _of_vehicles(c: Check) -> list[str]:
             )
         if nis is not None and row["fixes"] > ENOUGH and not 0.2 <= nis <= 2:
             word = "larger" if nis > 2 else "smaller"
-            part = when((c.world.t - c.world.t[0])[np.isfinite(c.normalised[:, column])], long_off(square / size))
+            part = when((c.world.t - c.world.t[0])[there], long_off(square / size))
             cause = f"Most are{part}: is one of the two held?" if part else "Give std columns or sensors=."
             sentences.append(
                 f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "

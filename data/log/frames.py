@@ -99,7 +99,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     none = _nowhere(rows)
     summary.refuse("fixes at zero, which are none", rows[none])
     rows = rows[~none]
-    geodetic, metric = rows["kind"].isin([*ENU]), only(rows, "x", "y")
+    geodetic, metric = rows["kind"].isin(ENU), only(rows, "x", "y")
     if not geodetic.any():
         return rows, origin
     if origin is None and len(metric):
@@ -135,7 +135,7 @@ def _nowhere(rows: Rows) -> Bools:
     ends = others.groupby(["vehicle", "kind"])["value"].agg(["min", "max", "size"])
     least = np.maximum(ends["min"], -ends["max"])
     away = ends.index[(least > ends["max"] - ends["min"]) & (ends["size"] >= MANY)].get_level_values("vehicle")
-    zero = zero[zero["kind"].isin([*ENU]) | zero["vehicle"].isin(away)]
+    zero = zero[zero["kind"].isin(ENU) | zero["vehicle"].isin(away)]
     at = rows.set_index(key).index.isin(zero.set_index(key).index)
     return np.asarray(at & in_group(rows, "fix"))
 

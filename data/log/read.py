@@ -181,12 +181,11 @@ def read_log(
             number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
     if origin is not None:
         origin_array = checked("origin", origin, "(3,)", (3,))
-        allowed = "must be latitude and longitude in degrees, and height in m"
         refuse(
             "origin",
             origin_array,
             ~(np.abs(origin_array) <= [90.0, 180.0, 1e6]),
-            allowed,
+            "must be latitude and longitude in degrees, and height in m",
             "Give origin=(48.14, 11.58, 520.0).",
         )
     options: dict[str, Any] = {
@@ -200,7 +199,7 @@ def read_log(
     by_kind, key, ends = rows["kind"].map(factor).fillna(1.0), rows["kind"], (rows["vehicle"], rows["partner"])
     for one, other in (ends, ends[::-1]):
         pair = one + "-" + other
-        key = key.mask((rows["kind"] == "range") & pair.isin(list(offset)), pair)
+        key = key.mask((rows["kind"] == "range") & pair.isin(offset), pair)
     less = key.map(factors(offset, dict.fromkeys((*KINDS, *key)), "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
@@ -212,7 +211,7 @@ def read_log(
         if unit:
             summary.assume(f"{column} is of 32-bit floats, multiples of {unit:.2g} s: write it in 64 bits")
     _check_one_drive(rows, path)
-    if origin is not None and not rows["kind"].isin([*ENU]).any():
+    if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin, summary)

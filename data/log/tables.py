@@ -1,12 +1,13 @@
 """Tables of a log: one row per measurement (long), or one column per kind (wide)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError, suggestion
 
 from ..bag import STAMP, TRUTH, of_topic
@@ -91,11 +92,11 @@ def _long(
     frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
 ) -> pd.DataFrame:
     frame = frame.assign(kind=words(frame, "kind", file))
-    left = frame["kind"].isin(list(ignore))
+    left = frame["kind"].isin(ignore)
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
         summary.leave(f"kind {kind}, as ignore= asks", int(count))
     frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
-    strange = frame["kind"][~frame["kind"].isin(list(KINDS))]
+    strange = frame["kind"][~frame["kind"].isin(KINDS)]
     if len(strange):
         first, *others = dict.fromkeys(strange.tolist())
         more = f" Unknown too: {', '.join(map(repr, others))}." if others else ""
@@ -156,23 +157,25 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
     for mask, column in ((~message, value), (message, "arrival")):
         if mask.any() and column not in frame.columns:
             raise missing_column(file, column, list(frame.columns), "is needed")
-    made: dict[str, Any] = {"vehicle": words(frame, "vehicle", file), "arrival": np.nan}
-    made |= {"value": numeric(frame, value, file, ~message), "std": np.nan}
+
+    def read(reader: Callable[..., Any], column: str, there: Bools, blank: Any = np.nan) -> AnyArray:
+        """What a column holds in the rows that have it."""
+        cells = np.full(len(frame), blank, dtype=object if blank == "" else float)
+        if there.any():
+            cells[there] = reader(frame[there], column, file)
+        return cells
+
+    made: dict[str, Any] = {"vehicle": words(frame, "vehicle", file), "value": read(numeric, value, ~message)}
     if std in frame:
-        made["std"] = numeric(frame, std, file, filled(frame[std]))
+        made["std"] = read(numeric, std, filled(frame[std]))
     if "t" in frame:
         made["t"] = seconds(frame, "t", file)
     if "partner" in frame:
-        partners = filled(frame["partner"])
-        made["partner"] = np.full(len(frame), "", dtype=object)
-        made["partner"][partners] = words(frame[partners], "partner", file)
+        made["partner"] = read(words, "partner", filled(frame["partner"]), "")
     if message.any():
         cells = frame["arrival"]
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()
-        if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":
-            cells = cells.astype(str).str.replace(",", ".")  # text, as it may hold "lost", whatever the decimal mark
-        timed = message & ~lost
-        made["arrival"] = np.where(lost, np.inf, np.nan)
-        if timed.any():
-            made["arrival"][timed] = seconds(frame.assign(arrival=cells)[timed], "arrival", file)
+        if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":  # as it may hold "lost", whatever the decimal mark
+            frame = frame.assign(arrival=cells.astype(str).str.replace(",", "."))
+        made["arrival"] = np.where(lost, np.inf, read(seconds, "arrival", message & ~lost))
     return frame[["kind"]].assign(**made)
