@@ -200,10 +200,9 @@ def named_columns(
     for key in columns:
         if key not in allowed:
             raise unknown(f"{file}: key of columns", key, allowed, 'Give columns={"t": "name in the file"}.')
-    header_names = [str(header) for header in frame.columns]
-    frame = frame.rename(columns={header: key for key, header in columns.items()})
+    renamed = frame.rename(columns={header: key for key, header in columns.items()})
     for key in columns:
-        if (frame.columns == key).sum() > 1:
+        if (renamed.columns == key).sum() > 1:
             raise InputError(
                 f"{file}: columns[{key!r}]",
                 repr(columns[key]),
@@ -211,11 +210,10 @@ def named_columns(
                 "Rename or remove one of them.",
             )
     for key in needed:
-        if columns.get(key, key) not in header_names:
-            raise missing_column(
-                file, columns.get(key, key), header_names, f"columns {', '.join(needed)} are needed", key
-            )
-    return frame
+        header = columns.get(key, key)
+        if header not in frame:
+            raise missing_column(file, header, frame, f"columns {', '.join(needed)} are needed", key)
+    return renamed
 
 
 def usual_key(header: str) -> str:
@@ -229,9 +227,12 @@ def usual_key(header: str) -> str:
     return next((key for key, usual in USUAL.items() if parts & {key, *usual.split()}), "")
 
 
-def missing_column(file: str, column: str, names: Sequence[str], allowed: str, key: str = "") -> InputError:
-    """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
-    key = key or column
+def missing_column(
+    file: str, column: str, frame: "pd.DataFrame", allowed: str, key: str = "", more: str = ""
+) -> InputError:
+    """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant, and
+    `more`."""
+    key, names = key or column, list(frame.columns)
     usual = next((header for header in names if usual_key(header) == key), "")
     header = usual or "..."
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
@@ -241,7 +242,7 @@ def missing_column(file: str, column: str, names: Sequence[str], allowed: str, k
         f"{file}: column {column}",
         "missing",
         f"{allowed}; the file has {', '.join(names)}",
-        suggestion(column, names, hint),
+        suggestion(column, names, hint) + more,
     )
 
 
