@@ -131,9 +131,8 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     import pandas as pd
 
     column_values = frame[column]
-    kind = getattr(column_values.dtype, "kind", "O")
-    text = kind == "O" or isinstance(column_values.dtype, pd.StringDtype)
-    if text and len(column_values) and not pd.to_numeric(column_values, errors="coerce").notna().any():
+    kind = column_values.dtype.kind
+    if kind == "O" and len(column_values) and not pd.to_numeric(column_values, errors="coerce").notna().any():
         dates = pd.to_datetime(column_values, errors="coerce", format="ISO8601", utc=True)
         if dates.notna().all():
             column_values, kind = dates, "M"

@@ -212,8 +212,10 @@ def _of_vehicles(c: Check) -> list[str]:
         column = c.world.ids.index(name)
         there = np.isfinite(c.normalised[:, column])
         square = size * c.normalised[there, column]
-        usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
-        outliers = np.mean(square > OUTLYING**2 * usual) if len(square) else 0.0
+        outliers = 0.0
+        if len(square) > ENOUGH:
+            usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04)
+            outliers = np.mean(square > OUTLYING**2 * usual)
         if outliers > max(OUTLIERS, SEVERAL / max(len(square), 1)):
             sentences.append(
                 f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "

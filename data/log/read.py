@@ -364,14 +364,13 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
     begins, ends = spans["min"].to_numpy(), np.maximum.accumulate(spans["max"].to_numpy())
     gaps = begins[1:] - ends[:-1]
     covered = ends[-1] - begins[0] - gaps.clip(0.0).sum() if len(spans) else 0.0
-    if (gaps <= max(APART, covered)).all():
-        return
-    raise InputError(
-        path.name,
-        "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
-        f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
-        "Give each drive a folder of its own, and name that.",
-    )
+    if (gaps > max(APART, covered)).any():
+        raise InputError(
+            path.name,
+            "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
+            f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
+            "Give each drive a folder of its own, and name that.",
+        )
 
 
 def _check_scale(rows: Rows, name: str) -> None:
@@ -424,21 +423,22 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
-    dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
-    if dt is None and dense < step:
-        seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
-        summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
-        step = dense
-    seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
-    if dt is None and not body and pairs > step and seldom > step:
-        summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
-        step = seldom
     if dt is None:
+        dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
+        if dense < step:
+            seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
+            summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
+            step = dense
+        seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
+        if not body and pairs > step and seldom > step:
+            often = f"odometry every {step:g} s is averaged"
+            summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; {often}")
+            step = seldom
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
             steps = at.assign(t=((at["t"] - t.min()) / step).round())
-            return float(steps.duplicated(["vehicle", "t"]).mean()) if len(at) else 0.0
+            return float(steps.duplicated(["vehicle", "t"]).mean())
 
         parts = next((n for n in (1, 2, 3, 4, 5) if lost(step / n) <= LOST), 1)
         if parts > 1:

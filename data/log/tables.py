@@ -171,7 +171,7 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
     if message.any():
         cells = frame["arrival"]
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()
-        if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":  # as it may hold "lost", whatever the decimal mark
+        if cells.dtype.kind in "OUT":  # as it may hold "lost", whatever the decimal mark
             frame = frame.assign(arrival=cells.astype(str).str.replace(",", "."))
         made["arrival"] = np.where(lost, np.inf, read(seconds, "arrival", message & ~lost))
     return frame[["kind"]].assign(**made)

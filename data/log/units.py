@@ -137,8 +137,8 @@ def _leaps(ranges: Rows, number: float) -> Bools:
         ranges["value"][some].groupby(pair).diff().abs()[lambda step: step > 0.0] for some in (same | True, ~same)
     )
     leaps = leaps[same | same.shift(fill_value=False)]
-    often = same.sum() >= FEW and len(leaps) and len(plain)
-    return (same & bool(often and leaps.median() > FEW * plain.quantile(0.8))).to_numpy()
+    often = same.sum() >= FEW and leaps.median() > FEW * plain.quantile(0.8)
+    return (same & bool(often)).to_numpy()
 
 
 def check_values(rows: Rows) -> None:
