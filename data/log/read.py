@@ -453,20 +453,20 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:
     """Truth of the members that have one, on the steps of the recording; a file that names none is that of the only
     one."""
-    ids, start, vehicles = recording.ids, recording.t[0], sorted(rows["vehicle"].unique())
-    if len(ids) == 1 and vehicles == [Path(rows["file"].iloc[0]).stem]:
+    ids, steps, vehicles, file = recording.ids, recording.t, sorted(rows["vehicle"].unique()), rows["file"].iloc[0]
+    if len(ids) == 1 and vehicles == [Path(file).stem]:
         rows = rows.assign(vehicle=ids[0])
     elif not set(vehicles) & set(ids):
         raise InputError(
-            f"{rows['file'].iloc[0]}: column vehicle",
+            f"{file}: column vehicle",
             ", ".join(vehicles),
             f"must name vehicles of the log: {', '.join(ids)}",
             "Rename them, or leave the truth out.",
         )
     if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
-        rows = rows.assign(t=rows["t"] + DAY * round((recording.t.mean() - rows["t"].mean()) / DAY))
+        rows = rows.assign(t=rows["t"] + DAY * round((steps.mean() - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
-    poses = np.full((len(recording.t), len(ids), 4), np.nan)
+    poses = np.full((len(steps), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
         own_rows = rows[rows["vehicle"] == vehicle]
         true, heading = samples(own_rows, ("x", "y", "z"), Summary(), axes), samples(own_rows, ("heading",), Summary())
@@ -475,19 +475,19 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
             out = poses[:, column, first : first + 3]
             if len(t) > 1:
                 gap = longest_gap(t, recording.dt, max_gap)
-                out[:] = interpolate(t - start, value, recording.t - start, gap)
+                out[:] = interpolate(t - steps[0], value, steps - steps[0], gap)
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
     if not np.isfinite(position).any():
         raise InputError(
-            f"{rows['file'].iloc[0]}: column t",
+            f"{file}: column t",
             f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s",
-            f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s",
+            f"must overlap the log, from {steps[0]:.10g} to {steps[-1]:.10g} s",
             "Does its clock or its date differ?",
         )
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
-    velocity = backward_difference(recording.t, position, ids)
+    velocity = backward_difference(steps, position, ids)
     turned = wrap(angle) if np.isfinite(angle).any() else None
-    return Fleet(ids, recording.t, position, velocity, name=name, source=f"truth of {name}", heading=turned)
+    return Fleet(ids, steps, position, velocity, name=name, source=f"truth of {name}", heading=turned)
