@@ -82,8 +82,7 @@ def check(log: Log) -> Check:
     first = filtered(log)
     bar.update()
     rows = _vehicles(first)
-    every = first.world.ids
-    errs, drifts = ([every.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
+    errs, drifts = ([first.world.ids.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
     result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
     bar.update()
     result = replace(result, vehicles=_vehicles(result))

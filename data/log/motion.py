@@ -141,11 +141,11 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
         summary: counts samples without the first `required` kinds.
         required: how many of the kinds a sample needs.
     """
-    rows = only(rows, *names)
+    rows, needed = only(rows, *names), list(names[:required])
     table = rows.pivot(index="t", columns="kind", values="value").reindex(columns=list(names))
-    whole = table[list(names[:required])].notna().all(axis=1)
-    reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
-    summary.refuse(reason, only(rows[rows["t"].isin(table.index[~whole])], *names[:required]))
+    whole = table[needed].notna().all(axis=1)
+    reason = f"incomplete rows, without all of {', '.join(needed)} at one time"
+    summary.refuse(reason, only(rows[rows["t"].isin(table.index[~whole])], *needed))
     return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
 
 

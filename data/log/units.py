@@ -259,8 +259,8 @@ class Summary:
     def unread(self) -> str:
         """Sentences on columns that are of no kind."""
         truth = " A truth is another table: truth=FILE." * ("tru" in self.columns or "gt" in self.columns)
-        name = "Name what is meant with columns= or kinds=."
-        return f"columns not read: {self.columns}. {name}{truth}" if self.columns else ""
+        hint = f"Name what is meant with columns= or kinds=.{truth}"
+        return f"columns not read: {self.columns}. {hint}" if self.columns else ""
 
     @property
     def columns(self) -> str:
