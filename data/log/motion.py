@@ -256,7 +256,7 @@ def climbing(fixes: Signal) -> float:
         now = np.flatnonzero(later < len(t))
         if len(now) < 3:
             break
-        near, far = ((np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
+        near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
         near *= 1.0 + 2.0 / len(now) ** 0.5
         wander = max(far - near, 0.0) / float(np.mean(t[later[now]] - t[now]))
         if far > 2.0 * near:
