@@ -103,16 +103,10 @@ def headers(path: Path) -> list[str]:
         return []
 
 
-def numeric(frame: "pd.DataFrame", column: str, file: str, given: Bools | None = None) -> Floats:
-    """A column as finite numbers, NaN where not `given` (default: everywhere); InputError with the row of the first
-    cell that is none."""
+def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
+    """A column as finite numbers; InputError with the row of the first cell that is none."""
     import pandas as pd
 
-    if given is not None:
-        out = np.full(len(frame), np.nan)
-        if given.any():
-            out[given] = numeric(frame[given], column, file)
-        return out
     cells = frame[column]
     if cells.dtype.kind in "bmM":
         raise InputError(
@@ -137,9 +131,8 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     import pandas as pd
 
     column_values = frame[column]
-    kind = getattr(column_values.dtype, "kind", "O")
-    text = kind == "O" or isinstance(column_values.dtype, pd.StringDtype)
-    if text and len(column_values) and not pd.to_numeric(column_values, errors="coerce").notna().any():
+    kind = column_values.dtype.kind
+    if kind == "O" and len(column_values) and not pd.to_numeric(column_values, errors="coerce").notna().any():
         dates = pd.to_datetime(column_values, errors="coerce", format="ISO8601", utc=True)
         if dates.notna().all():
             column_values, kind = dates, "M"
@@ -206,10 +199,9 @@ def named_columns(
     for key in columns:
         if key not in allowed:
             raise unknown(f"{file}: key of columns", key, allowed, 'Give columns={"t": "name in the file"}.')
-    header_names = [str(header) for header in frame.columns]
-    frame = frame.rename(columns={header: key for key, header in columns.items()})
+    renamed = frame.rename(columns={header: key for key, header in columns.items()})
     for key in columns:
-        if (frame.columns == key).sum() > 1:
+        if (renamed.columns == key).sum() > 1:
             raise InputError(
                 f"{file}: columns[{key!r}]",
                 repr(columns[key]),
@@ -217,11 +209,10 @@ def named_columns(
                 "Rename or remove one of them.",
             )
     for key in needed:
-        if columns.get(key, key) not in header_names:
-            raise missing_column(
-                file, columns.get(key, key), header_names, f"columns {', '.join(needed)} are needed", key
-            )
-    return frame
+        header = columns.get(key, key)
+        if header not in frame:
+            raise missing_column(file, header, frame, f"columns {', '.join(needed)} are needed", key)
+    return renamed
 
 
 def usual_key(header: str) -> str:
@@ -235,9 +226,12 @@ def usual_key(header: str) -> str:
     return next((key for key, usual in USUAL.items() if parts & {key, *usual.split()}), "")
 
 
-def missing_column(file: str, column: str, names: Sequence[str], allowed: str, key: str = "") -> InputError:
-    """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
-    key = key or column
+def missing_column(
+    file: str, column: str, frame: "pd.DataFrame", allowed: str, key: str = "", more: str = ""
+) -> InputError:
+    """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant, and
+    `more`."""
+    key, names = key or column, list(frame.columns)
     usual = next((header for header in names if usual_key(header) == key), "")
     header = usual or "..."
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
@@ -247,7 +241,7 @@ def missing_column(file: str, column: str, names: Sequence[str], allowed: str, k
         f"{file}: column {column}",
         "missing",
         f"{allowed}; the file has {', '.join(names)}",
-        suggestion(column, names, hint),
+        suggestion(column, names, hint) + more,
     )
 
 

@@ -82,7 +82,7 @@ class Entry:
     def address(self, file: str) -> str:
         """Where a file is served; below a mirror as it lies in the folder of all data."""
         mirror = os.environ.get("COOPOC_MIRROR", "")
-        return f"{mirror.rstrip('/')}/{quote(f'{self.name}/{file}')}" if mirror else self.files[file][0] or self.archive
+        return f"{mirror.rstrip('/')}/{quote(f'{self.name}/{file}')}" if mirror else self.archive or self.files[file][0]
 
 
 @cache

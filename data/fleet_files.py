@@ -36,7 +36,7 @@ def read_table(
     """
     names = dict(columns or {})
     frame = read_frame(path, names.get("id", "id"))
-    has_velocity = bool({*VELOCITY} & {*names, *frame.columns})
+    has_velocity = bool({*VELOCITY} & {*names, *frame})
     used = NEEDED + has_velocity * VELOCITY
     frame = named_columns(frame, names, (*NEEDED, *VELOCITY), used, path.name)
     source = f"table {path.name}" + ("" if has_velocity else ", velocity by backward difference")

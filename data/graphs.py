@@ -27,9 +27,8 @@ def read_graph_log(path: Path, *, dt: float = 0.1) -> Log:
     summary = Summary(path.name, steps_in_words(recording), vehicles)
     summary.count("ranges", len(recording.links))
     summary.count("bearings", int(np.isfinite(recording.relative[0, :, 1]).sum()))
-    left = len(graph.ranges) + len(_vectors(graph)) - len(recording.links)
     where = "outside the steps that all robots share, beside another of the same pair and step, or between points"
-    summary.refuse(f"edges {where}", left)
+    summary.refuse(f"edges {where}", len(graph.ranges) + len(_vectors(graph)) - len(recording.links))
     summary.refuse("priors", len(graph.pose_prior) + len(graph.point_prior))
     return Log(recording, truth, summary, True)
 

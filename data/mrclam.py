@@ -310,12 +310,12 @@ def grouped(error: Floats, observer: Floats | Ints, t: Floats) -> float:
 def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     """Standard deviations m and rad of white noise as informative as the ranges and bearings are."""
     marks = log.sightings[log.sightings[:, 2] >= 0]
-    own, end = np.full((len(marks), 3), np.nan), log.fleet.t[-1]
-    for column in range(len(log.fleet.ids)):  # poses by Vicon, NaN in gaps
-        path = np.column_stack([log.fleet.position[:, column, :2], log.heading[:, column]])
-        inside = (marks[:, 1] == column) & (marks[:, 0] >= 0) & (marks[:, 0] <= end)
-        present = log.fleet.present[:, column]
-        own[inside] = interpolate(log.fleet.t[present], path[present], marks[inside, 0], 2 * log.fleet.dt)
+    paths = np.dstack([log.fleet.position[..., :2], log.heading])  # by Vicon
+    poses = [
+        interpolate(log.fleet.t[there], path[there], marks[:, 0], 2 * log.fleet.dt)
+        for path, there in zip(paths.swapaxes(0, 1), log.fleet.present.T, strict=True)
+    ]
+    own = np.stack(poses)[marks[:, 1].astype(np.int64), np.arange(len(marks))]
     dx, dy = (log.landmarks[marks[:, 2].astype(np.int64), 1:] - own[:, :2]).T
     t, observer = np.append(log.others[:, 0], marks[:, 0]), np.append(log.others[:, 1], marks[:, 1])
     reach = np.append(log.others[:, 3] - log.true_others[:, 0], marks[:, 3] - np.hypot(dx, dy))

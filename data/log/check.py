@@ -86,8 +86,7 @@ def check(log: Log) -> Check:
     first = filtered(log)
     bar.update()
     rows = _vehicles(first)
-    every = first.world.ids
-    errs, drifts = ([every.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
+    errs, drifts = ([first.world.ids.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
     result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
     bar.update()
     result = replace(result, vehicles=_vehicles(result))
@@ -220,9 +219,12 @@ def _of_vehicles(c: Check) -> list[str]:
     for row in c.vehicles:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
         column = c.world.ids.index(name)
-        square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
-        usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
-        outliers = np.mean(square > OUTLYING**2 * usual) if len(square) else 0.0
+        there = np.isfinite(c.normalised[:, column])
+        square = size * c.normalised[there, column]
+        outliers = 0.0
+        if len(square) > ENOUGH:
+            usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04)
+            outliers = np.mean(square > OUTLYING**2 * usual)
         if outliers > max(OUTLIERS, SEVERAL / max(len(square), 1)):
             sentences.append(
                 f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
@@ -230,7 +232,7 @@ def _of_vehicles(c: Check) -> list[str]:
             )
         if nis is not None and row["fixes"] > ENOUGH and not 0.2 <= nis <= 2:
             word = "larger" if nis > 2 else "smaller"
-            part = when((c.world.t - c.world.t[0])[np.isfinite(c.normalised[:, column])], long_off(square / size))
+            part = when((c.world.t - c.world.t[0])[there], long_off(square / size))
             cause = f"Most are{part}: is one of the two held?" if part else "Give std columns or sensors=."
             sentences.append(
                 f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "

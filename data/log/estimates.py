@@ -389,17 +389,17 @@ def _beside(off: AnyArray, velocity: AnyArray) -> float:
 def against_truth(c: Check) -> Check:
     """The same, with ranges, and in the world directions, against the truth where both ends have one that
     their fixes fit, or one stands as a landmark; without those of vehicles whose fixes do not fit."""
-    truth, noise = c.log.truth, c.world.sensors
+    truth, rec, noise = c.log.truth, c.world, c.world.sensors
     if truth is None:
         return c
-    marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
+    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks)
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
-    residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
+    residual, stated = residual_of(rec, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
     relative, expected = (np.where(used, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
-    fit = (fits | marks)[[c.world.links.observer, c.world.links.neighbour]].all(axis=0)  # of others nothing is known
+    fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)  # of others nothing is known
     return replace(c, relative=np.where(fit[:, None], relative, np.nan), expected=expected)
 
 

@@ -41,12 +41,13 @@ HEADING_STD = 0.05
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
     """Rows whose stamps go on where those of a vehicle begin anew, at midnight or at the end of a GPS week; those of
     another file, such as the truth, may count on."""
-    back = rows["t"] < rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
+    t = rows["t"]
+    back = t < rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
     last = rows.groupby(["file", "vehicle"], sort=False)["t"].shift()
     for period in PERIODS:
-        inside = rows["t"].dropna().between(0, 1.25 * period)
-        away = rows["t"].between(0.25 * period, 0.75 * period)
-        if (rows["t"] < last - 0.9 * period).any() and inside.all() and not away.any():
+        inside = t.dropna().between(0, 1.25 * period)
+        away = t.between(0.25 * period, 0.75 * period)
+        if (t < last - 0.9 * period).any() and inside.all() and not away.any():
             summary.assume(f"stamps begin anew after {period:g} s: those before half of it count on")
             early = {name: rows[name].mask(rows[name] < period / 2, rows[name] + period) for name in ("t", "arrival")}
             return rows.assign(**early)
@@ -67,7 +68,7 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     """
     if rows["t"].isna().all():
         raise InputError("t", "in no file", "must be a column of some table", "Give the times of what was measured.")
-    columns("clock", list(clock), sorted(rows["vehicle"].unique()))
+    columns("clock", clock, sorted(rows["vehicle"].unique()))
     ahead, partner_ahead = (rows[who].map(clock).fillna(0.0) for who in ("vehicle", "partner"))
     t = (rows["t"].fillna(rows["t"].min()) - ahead).round(6)
     rows = rows.assign(t=t, arrival=rows["arrival"] - partner_ahead)
@@ -99,7 +100,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     none = _nowhere(rows)
     summary.refuse("fixes at zero, which are none", rows[none])
     rows = rows[~none]
-    geodetic, metric = rows["kind"].isin([*ENU]), only(rows, "x", "y")
+    geodetic, metric = rows["kind"].isin(ENU), only(rows, "x", "y")
     if not geodetic.any():
         return rows, origin
     if origin is None and len(metric):
@@ -135,7 +136,7 @@ def _nowhere(rows: Rows) -> Bools:
     ends = others.groupby(["vehicle", "kind"])["value"].agg(["min", "max", "size"])
     least = np.maximum(ends["min"], -ends["max"])
     away = ends.index[(least > ends["max"] - ends["min"]) & (ends["size"] >= MANY)].get_level_values("vehicle")
-    zero = zero[zero["kind"].isin([*ENU]) | zero["vehicle"].isin(away)]
+    zero = zero[zero["kind"].isin(ENU) | zero["vehicle"].isin(away)]
     at = rows.set_index(key).index.isin(zero.set_index(key).index)
     return np.asarray(at & in_group(rows, "fix"))
 

@@ -106,7 +106,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
 def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
     """Rows in which vehicles measure: a range that a landmark measured is one to it; whatever else it measured or sent
     says nothing without its heading."""
-    own, theirs = (rows[who].isin(list(landmarks)) for who in ("vehicle", "partner"))
+    own, theirs = (rows[who].isin(landmarks) for who in ("vehicle", "partner"))
     turned = own & ~theirs & (rows["kind"] == "range")
     left = own & ~turned & in_group(rows, "relative", "message")
     summary.refuse("messages of landmarks, and what they measured but ranges to vehicles", rows[left])

@@ -140,11 +140,11 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
         summary: counts samples without the first `required` kinds.
         required: how many of the kinds a sample needs.
     """
-    rows = only(rows, *names)
+    rows, needed = only(rows, *names), list(names[:required])
     table = rows.pivot(index="t", columns="kind", values="value").reindex(columns=list(names))
-    whole = table[list(names[:required])].notna().all(axis=1)
-    reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
-    summary.refuse(reason, only(rows[rows["t"].isin(table.index[~whole])], *names[:required]))
+    whole = table[needed].notna().all(axis=1)
+    reason = f"incomplete rows, without all of {', '.join(needed)} at one time"
+    summary.refuse(reason, only(rows[rows["t"].isin(table.index[~whole])], *needed))
     return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
 
 
@@ -260,7 +260,7 @@ def climbing(fixes: Signal) -> float:
         now = np.flatnonzero(later < len(t))
         if len(now) < 3:
             break
-        near, far = ((np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
+        near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
         near *= 1.0 + 2.0 / len(now) ** 0.5
         wander = max(far - near, 0.0) / float(np.mean(t[later[now]] - t[now]))
         if far > 2.0 * near:

@@ -185,12 +185,11 @@ def read_log(
             number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
     if origin is not None:
         origin_array = checked("origin", origin, "(3,)", (3,))
-        allowed = "must be latitude and longitude in degrees, and height in m"
         refuse(
             "origin",
             origin_array,
             ~(np.abs(origin_array) <= [90.0, 180.0, 1e6]),
-            allowed,
+            "must be latitude and longitude in degrees, and height in m",
             "Give origin=(48.14, 11.58, 520.0).",
         )
     options: dict[str, Any] = {
@@ -204,8 +203,8 @@ def read_log(
     by_kind, key, ends = rows["kind"].map(factor).fillna(1.0), rows["kind"], (rows["vehicle"], rows["partner"])
     for one, other in (ends, ends[::-1]):
         pair = one + "-" + other
-        key = key.mask((rows["kind"] == "range") & pair.isin(list(offset)), pair)
-    less = key.map(factors(offset, {*KINDS, *key}, "offset")).fillna(0.0)
+        key = key.mask((rows["kind"] == "range") & pair.isin(offset), pair)
+    less = key.map(factors(offset, dict.fromkeys((*KINDS, *key)), "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = without_codes(unwrapped(rows, summary), summary)
@@ -216,12 +215,12 @@ def read_log(
         if unit:
             summary.assume(f"{column} is of 32-bit floats, multiples of {unit:.2g} s: write it in 64 bits")
     _check_one_drive(rows, path)
-    if origin is not None and not rows["kind"].isin([*ENU]).any():
+    if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     summary.rows = int((rows["true"] == 0).sum())
     rows, true_rows = not_vague(rows[rows["true"] == 0], summary), rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin, summary)
-    deviations = factors(std, KINDS.keys() - {"message"}, "std")
+    deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
     if not any_scale:
@@ -370,14 +369,13 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
     begins, ends = spans["min"].to_numpy(), np.maximum.accumulate(spans["max"].to_numpy())
     gaps = begins[1:] - ends[:-1]
     covered = ends[-1] - begins[0] - gaps.clip(0.0).sum() if len(spans) else 0.0
-    if (gaps <= max(APART, covered)).all():
-        return
-    raise InputError(
-        path.name,
-        "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
-        f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
-        "Give each drive a folder of its own, and name that.",
-    )
+    if (gaps > max(APART, covered)).any():
+        raise InputError(
+            path.name,
+            "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
+            f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
+            "Give each drive a folder of its own, and name that.",
+        )
 
 
 def _check_scale(rows: Rows, name: str) -> None:
@@ -430,21 +428,22 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
-    dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
-    if dt is None and dense < step:
-        seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
-        summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
-        step = dense
-    seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
-    if dt is None and not body and pairs > step and seldom > step:
-        summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
-        step = seldom
     if dt is None:
+        dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
+        if dense < step:
+            seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
+            summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
+            step = dense
+        seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
+        if not body and pairs > step and seldom > step:
+            often = f"odometry every {step:g} s is averaged"
+            summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; {often}")
+            step = seldom
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
             steps = at.assign(t=((at["t"] - t.min()) / step).round())
-            return float(steps.duplicated(["vehicle", "t"]).mean()) if len(at) else 0.0
+            return float(steps.duplicated(["vehicle", "t"]).mean())
 
         parts = next((n for n in (1, 2, 3, 4, 5) if lost(step / n) <= LOST), 1)
         if parts > 1:
@@ -459,24 +458,24 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, summary: Summary) -> Fleet:
     """Truth of the members that have one, on the steps of the recording; a file that names none is that of the only
     one."""
-    ids, start, vehicles = recording.ids, recording.t[0], sorted(rows["vehicle"].unique())
-    if len(ids) == 1 and vehicles == [Path(rows["file"].iloc[0]).stem]:
+    ids, steps, vehicles, file = recording.ids, recording.t, sorted(rows["vehicle"].unique()), rows["file"].iloc[0]
+    if len(ids) == 1 and vehicles == [Path(file).stem]:
         rows = rows.assign(vehicle=ids[0])
     elif not set(vehicles) & set(ids):
         raise InputError(
-            f"{rows['file'].iloc[0]}: column vehicle",
+            f"{file}: column vehicle",
             ", ".join(vehicles),
             f"must name vehicles of the log: {', '.join(ids)}",
             "Rename them, or leave the truth out.",
         )
     if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
-        rows = rows.assign(t=rows["t"] + DAY * round((recording.t.mean() - rows["t"].mean()) / DAY))
+        rows = rows.assign(t=rows["t"] + DAY * round((steps.mean() - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
     heights = pd.DataFrame(recording.gnss[0, ..., 2])
     heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")
     if axes == 2 and heights.abs().max(axis=None) > 0.0:
         summary.assume("the truth has no heights: means of the fixes' over 20 s stand for them, and for their errors")
-    poses = np.full((len(recording.t), len(ids), 4), np.nan)
+    poses = np.full((len(steps), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
         own_rows = rows[rows["vehicle"] == vehicle]
         true, heading = samples(own_rows, ("x", "y", "z"), Summary(), axes), samples(own_rows, ("heading",), Summary())
@@ -485,27 +484,25 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             out = poses[:, column, first : first + 3]
             if len(t) > 1:
                 gap = longest_gap(t, recording.dt, max_gap)
-                out[:] = interpolate(t - start, value, recording.t - start, gap)
+                out[:] = interpolate(t - steps[0], value, steps - steps[0], gap)
                 if np.median(np.diff(t)) > COARSE and len(t) > 2:
-                    summary.assume(
-                        f"a truth that is seldom counts within {COARSE:g} s, on a curve through all (Akima's)"
-                    )
-                    near = covered(t, recording.t, 0.0, COARSE)[:, None] & np.isfinite(out)
-                    out[:] = np.where(near, Akima1DInterpolator(t - start, value)(recording.t - start), np.nan)
+                    summary.assume(f"a seldom truth counts within {COARSE:g} s, on a curve through all (Akima's)")
+                    near = covered(t, steps, 0.0, COARSE)[:, None] & np.isfinite(out)
+                    out[:] = np.where(near, Akima1DInterpolator(t - steps[0], value)(steps - steps[0]), np.nan)
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
     if not np.isfinite(position).any():
         raise InputError(
-            f"{rows['file'].iloc[0]}: column t",
+            f"{file}: column t",
             f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s",
-            f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s",
+            f"must overlap the log, from {steps[0]:.10g} to {steps[-1]:.10g} s",
             "Does its clock or its date differ?",
         )
     if axes == 2:
         position[..., 2] = heights.fillna(0.0).where(np.isfinite(position[..., 0]))
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
-    velocity = backward_difference(recording.t, position, ids)
+    velocity = backward_difference(steps, position, ids)
     turned = wrap(angle) if np.isfinite(angle).any() else None
-    return Fleet(ids, recording.t, position, velocity, name=name, source=f"truth of {name}", heading=turned)
+    return Fleet(ids, steps, position, velocity, name=name, source=f"truth of {name}", heading=turned)

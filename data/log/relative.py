@@ -43,30 +43,26 @@ def measurements(c: Check) -> list[dict[str, Any]]:
         if not there.any() or np.ptp(c.log.recording.relative[0, there, k]) == 0:
             continue
         named = {pair: offset for pair, offset, _ in _named(c, k, stated)}
-        less = np.concatenate([value - named.get(pair, 0.0) for pair, value, *_ in by_pair(c, k)])
-        row = {
-            "measurement": name,
-            "unit": unit,
-            "number": len(residual),
-            "median": float(np.median(residual)),
-            "robust_std": robust_std(less),
-            "stated_std": stated,
-            "expected_std": float(np.sqrt(np.mean(c.expected[there, k] ** 2))),
-        }
-        rows.append(row | _scatter(c, k, stated))
+        pairs, values, expected, _ = zip(*by_pair(c, k), strict=True)
+        less = [value - named.get(pair, 0.0) for pair, value in zip(pairs, values, strict=True)]
+        near = [value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for value in values]
+        off = np.concatenate(near)  # errors of the filters last longer than that window
+        noise, doubt = robust_std(off), np.concatenate(expected) / 2  # a direction of what is near hardly counts
+        least = np.maximum(max(noise, 0.2 * stated), doubt)
+        rows.append(
+            {
+                "measurement": name,
+                "unit": unit,
+                "number": len(residual),
+                "median": float(np.median(residual)),
+                "robust_std": robust_std(np.concatenate(less)),
+                "stated_std": stated,
+                "expected_std": float(np.sqrt(np.mean(c.expected[there, k] ** 2))),
+                "noise": noise,
+                "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * least)),
+            }
+        )
     return rows
-
-
-def _scatter(c: Check, k: int, stated: float) -> dict[str, float]:
-    """Standard deviation of measurements about the running median of their pair, and the share beyond 5 of them: errors
-    of the filters last longer than that window."""
-    near = [
-        (value - pd.Series(value).rolling(WINDOW, 1, center=True).median(), each) for _, value, each, _ in by_pair(c, k)
-    ]
-    off, expected = (np.concatenate(parts) for parts in zip(*near, strict=True))
-    noise = robust_std(off)
-    least = np.maximum(max(noise, 0.2 * stated), expected / 2)  # a direction of what is near hardly counts
-    return {"noise": noise, "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * least))}
 
 
 def of_ranges(c: Check) -> list[str]:

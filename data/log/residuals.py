@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import InputError, Kalman, PoseFilter, Recording, pose_start
+from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.poses.pose_inputs import SPREAD
@@ -146,10 +146,8 @@ def filtered(log: Log) -> Check:
         parts = [(0, steps, filter_(rec, _moving(rec)))]
         if log.truth is not None:
             track = replace(filter_, unit="fleet")(rec, _moving(rec))
-            assert track.covariance is not None
             scored = x.copy(), variance.copy()
-            scored[0][:, list(track.egos)] = track.x[0]
-            scored[1][:, list(track.egos)] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
+            scored[0][:, track.egos], scored[1][:, track.egos] = track.x[0], _variance(track)
     else:
         stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
         parts = [
@@ -158,10 +156,9 @@ def filtered(log: Log) -> Check:
     for first, last, track in parts:
         there, columns, part = slice(first, last), list(track.egos), rec.between(first, last)
         squares = normalised_innovations(track, part)
-        assert track.covariance is not None
         assert squares is not None
         x[there, columns], fix[there, columns] = track.x[0], fix_innovations(track, part)[0]
-        variance[there, columns] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
+        variance[there, columns] = _variance(track)
         normalised[there, columns] = squares[0]
         for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
             lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]
@@ -183,6 +180,12 @@ def filtered(log: Log) -> Check:
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
     return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)), scored)
+
+
+def _variance(track: Track) -> Floats:
+    """(T, E, 3) m^2, in the first run."""
+    assert track.covariance is not None
+    return np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
 
 
 def plane(vectors: Floats) -> AnyArray:

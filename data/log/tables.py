@@ -1,12 +1,13 @@
 """Tables of a log: one row per measurement (long), or one column per kind (wide)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError, suggestion
 
 from ..bag import STAMP, TRUTH, of_topic
@@ -71,19 +72,18 @@ def read_log_table(
     if STAMP in frame:
         frame = of_topic(frame, file, summary, path.stem.lower() in TRUTH)
     frame = named_columns(frame, columns, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
-    if "t" not in frame.columns:
-        placed = {"x", "y"} <= set(frame.columns) or {"latitude", "longitude"} <= set(frame.columns)
-        if not (placed and "vehicle" in frame.columns and frame["vehicle"].is_unique):
-            raise missing_column(
-                file, "t", list(frame.columns), "is needed; one of places alone has vehicle, x, y, each vehicle once"
-            )
+    if "t" not in frame:
+        placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
+        if not (placed and "vehicle" in frame and frame["vehicle"].is_unique):
+            allowed = "is needed; one of places alone has vehicle, x, y, each vehicle once"
+            raise missing_column(file, "t", frame, allowed)
         summary.assume("members of a table without times stand where it says, from the first instant on")
-    if "vehicle" not in frame.columns:
+    if "vehicle" not in frame:
         frame = frame.assign(vehicle=path.stem)
-    read = _long if "kind" in frame.columns else _wide
+    read = _long if "kind" in frame else _wide
     rows = rows_of(read(frame, file, summary, kinds, ignore), file)
-    if "partner" not in frame.columns and (in_group(rows, "relative") & rows["partner"].eq("")).any():
-        raise missing_column(file, "partner", list(frame.columns), "is needed")
+    if "partner" not in frame and (in_group(rows, "relative") & rows["partner"].eq("")).any():
+        raise missing_column(file, "partner", frame, "is needed")
     return rows
 
 
@@ -91,11 +91,11 @@ def _long(
     frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
 ) -> pd.DataFrame:
     frame = frame.assign(kind=words(frame, "kind", file))
-    left = frame["kind"].isin(list(ignore))
+    left = frame["kind"].isin(ignore)
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
         summary.leave(f"kind {kind}, as ignore= asks", int(count))
     frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
-    strange = frame["kind"][~frame["kind"].isin(list(KINDS))]
+    strange = frame["kind"][~frame["kind"].isin(KINDS)]
     if len(strange):
         first, *others = dict.fromkeys(strange.tolist())
         more = f" Unknown too: {', '.join(map(repr, others))}." if others else ""
@@ -114,16 +114,13 @@ def _wide(
 ) -> pd.DataFrame:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     value = {kind: "arrival" if kind == "message" else kind for kind in KINDS if kind not in ignore}
-    value = {kind: column for kind, column in value.items() if column in frame.columns}
+    value = {kind: column for kind, column in value.items() if column in frame}
     columns = [] if "partner" in frame else [*map(str, frame.select_dtypes("number").columns)]
     beside = {column: found for column in columns if (found := _of_partner(column))}
     if not (value or beside):
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
-        error = missing_column(file, "kind", list(frame.columns), allowed)
-        raise InputError(
-            error.field, error.value, error.allowed, f'{error.hint} Or name the columns: kinds={{"...": "speed_kmh"}}.'
-        )
-    if "std" in frame.columns and {KINDS[kind].group for kind in value} == {"fix"}:
+        raise missing_column(file, "kind", frame, allowed, more=' Or name the columns: kinds={"...": "speed_kmh"}.')
+    if "std" in frame and {KINDS[kind].group for kind in value} == {"fix"}:
         summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(value)}")
         frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
     used = ["t", "vehicle", "partner", *value.values(), *(f"{name}_std" for name in (*value, *beside)), *beside]
@@ -154,25 +151,27 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
     """Times, names and numbers of a table with a column kind; `value` and `std` are the columns of these."""
     message = (frame["kind"] == "message").to_numpy()
     for mask, column in ((~message, value), (message, "arrival")):
-        if mask.any() and column not in frame.columns:
-            raise missing_column(file, column, list(frame.columns), "is needed")
-    made: dict[str, Any] = {"vehicle": words(frame, "vehicle", file), "arrival": np.nan}
-    made |= {"value": numeric(frame, value, file, ~message), "std": np.nan}
+        if mask.any() and column not in frame:
+            raise missing_column(file, column, frame, "is needed")
+
+    def read(reader: Callable[..., Any], column: str, there: Bools, blank: Any = np.nan) -> AnyArray:
+        """What a column holds in the rows that have it."""
+        cells = np.full(len(frame), blank, dtype=object if blank == "" else float)
+        if there.any():
+            cells[there] = reader(frame[there], column, file)
+        return cells
+
+    made: dict[str, Any] = {"vehicle": words(frame, "vehicle", file), "value": read(numeric, value, ~message)}
     if std in frame:
-        made["std"] = numeric(frame, std, file, filled(frame[std]))
+        made["std"] = read(numeric, std, filled(frame[std]))
     if "t" in frame:
         made["t"] = seconds(frame, "t", file)
     if "partner" in frame:
-        partners = filled(frame["partner"])
-        made["partner"] = np.full(len(frame), "", dtype=object)
-        made["partner"][partners] = words(frame[partners], "partner", file)
+        made["partner"] = read(words, "partner", filled(frame["partner"]), "")
     if message.any():
         cells = frame["arrival"]
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()
-        if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":
-            cells = cells.astype(str).str.replace(",", ".")  # text, as it may hold "lost", whatever the decimal mark
-        timed = message & ~lost
-        made["arrival"] = np.where(lost, np.inf, np.nan)
-        if timed.any():
-            made["arrival"][timed] = seconds(frame.assign(arrival=cells)[timed], "arrival", file)
+        if cells.dtype.kind in "OUT":  # as it may hold "lost", whatever the decimal mark
+            frame = frame.assign(arrival=cells.astype(str).str.replace(",", "."))
+        made["arrival"] = np.where(lost, np.inf, read(seconds, "arrival", message & ~lost))
     return frame[["kind"]].assign(**made)

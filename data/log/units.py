@@ -153,8 +153,8 @@ def _leaps(ranges: Rows, number: float) -> Bools:
         ranges["value"][some].groupby(pair).diff().abs()[lambda step: step > 0.0] for some in (same | True, ~same)
     )
     leaps = leaps[same | same.shift(fill_value=False)]
-    often = same.sum() >= FEW and len(leaps) and len(plain)
-    return (same & bool(often and leaps.median() > FEW * plain.quantile(0.8))).to_numpy()
+    often = same.sum() >= FEW and leaps.median() > FEW * plain.quantile(0.8)
+    return (same & bool(often)).to_numpy()
 
 
 def check_values(rows: Rows) -> None:
@@ -277,8 +277,8 @@ class Summary:
     def unread(self) -> str:
         """Sentences on columns that are of no kind."""
         truth = " A truth is another table: truth=FILE." * ("tru" in self.columns or "gt" in self.columns)
-        name = "Name what is meant with columns= or kinds=."
-        return f"columns not read: {self.columns}. {name}{truth}" if self.columns else ""
+        hint = f"Name what is meant with columns= or kinds=.{truth}"
+        return f"columns not read: {self.columns}. {hint}" if self.columns else ""
 
     @property
     def columns(self) -> str:
