@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ..escapes import picture
 from . import store
 from .style import RC, line, look
 
-FIXED: Mapping[str, Mapping[str, Any]] = {
+FIXED: Mapping[str, dict[str, Any]] = {
     "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
     "svg": {"Date": None, "Creator": None},
     "png": {"Software": None},
@@ -43,9 +44,7 @@ class Plot:
                 x, y, width, height = (round(side, 5) for side in axes.get_position(original=True).bounds)
                 axes.set_position((x, y, width, height))
             for suffix, metadata in FIXED.items():
-                buffer = BytesIO()
-                self.figure.savefig(buffer, format=suffix, metadata=dict(metadata))
-                store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
+                store.write(Path(f"{path}.{suffix}"), partial(self.figure.savefig, format=suffix, metadata=metadata))
         return self.caption
 
     def _repr_png_(self) -> bytes:
@@ -88,7 +87,7 @@ def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
     return {**look_of, "label": text}  # legends of matplotlib's own leave it out
 
 
-def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None) -> None:
+def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str]) -> None:
     """Draw the legend at the right: one entry per method and bound, and one per line style where noise models differ.
 
     Args:
@@ -103,7 +102,7 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
     styles: dict[Any, list[str]] = {}
     for names in lines:
         method, model = name_of(names), str(names.get("noise_model", "none"))
-        text = look(method).label + (words or {}).get(method, "")
+        text = look(method).label + words.get(method, "")
         if method == "bound":
             text += f", {model}" if len(bounds) > 1 else ""
         elif "method" in names and model != "none" and model not in styles.setdefault(line(model), []):
