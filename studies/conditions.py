@@ -3,18 +3,15 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from coopoc import Study
-from coopoc.study.numbers import Number, Where, across, listed, mean, ran, rms
+from coopoc.study.numbers import Number, Results, Where, across, listed, mean, ran, rms
 from coopoc.study.style import Panel, look
 
 from . import lineup, scene
 from .lineup import BOUND, PAST
 from .views import curves, of, selections
-
-if TYPE_CHECKING:
-    from coopoc import Results
 
 KALMAN, NET = ("kalman", "nominal"), ("fedkalmannet", "trained")
 COOPERATIVE, JOINT, SPLIT, LKF = ((m, "nominal") for m in ("cooperative-filter", "joint", "split-ci", "lkf-sa"))
@@ -52,7 +49,7 @@ def study(
     """
     methods, rows = labelled(*pairs), [((title,), case) for title, case in cases.items()]
 
-    def findings(results: "Results") -> dict[str, str]:
+    def findings(results: Results) -> dict[str, str]:
         texts = {}
         for title in named:
             each = ran({label: number(results, {**cases[title], **line}) for label, line in methods.items()})
