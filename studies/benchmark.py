@@ -133,12 +133,12 @@ def tried(name: str, task: Task) -> Row:
     row: Row = {"task": task.name, "rt_le_m": rounded(scores["rt_le_m"])}
     if held:
         least = bound(task, held)
-        rms = float(np.sqrt(np.mean(scores["rt_le_m"] ** 2)))
+        rms = np.sqrt(np.mean(scores["rt_le_m"] ** 2))
         row |= {"bound_m": round(least, 4), "information": held, "over_bound": round(rms / least, 3)}
     if "nees_inside" in scores:
         row["nees_inside"] = round(scores["nees_inside"].mean(), 3)
     row["received_bytes_per_second"] = round(scores["bytes_per_second"].mean())
-    row["microseconds_per_step"] = round(1e6 * float(scores["seconds"].mean()) / len(fleet.t), 2)
+    row["microseconds_per_step"] = round(1e6 * scores["seconds"].mean() / len(fleet.t), 2)
     return row
 
 

@@ -21,8 +21,7 @@ STAR = ("bound", "star")
 
 def labelled(*pairs: tuple[str, str]) -> dict[str, Where]:
     """Label -> selection of each method under its noise model; a bound has the name of its information set."""
-    named = {(m, k): f", {k}" * (m == "bound" != k) for m, k in pairs}
-    return {look(method).label + more: of(method, model) for (method, model), more in named.items()}
+    return {look(m).label + (f", {k}" if m == "bound" and k != "bound" else ""): of(m, k) for m, k in pairs}
 
 
 def study(

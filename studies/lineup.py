@@ -101,8 +101,7 @@ def methods(p: Params) -> "list[tuple[int | None, Method]]":
     """
     name, first = p["method"], start(p)
     if weights.is_trained(name):
-        models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
-        return [(seed, model.method(name, first)) for seed, model in models]
+        return [(seed, weights.checkpoint(name, p, seed).model.method(name, first)) for seed in weights.seeds(p)]
     method = own(name, noise_model(p))
     if hasattr(method, "x0"):
         method = replace(method, x0=first)

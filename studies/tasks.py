@@ -132,11 +132,10 @@ def bound(task: Task, information: str) -> float:
     """
     fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
-    wrong = bool(sensors.outliers or task.attack.share)
-    runs = FEW if information in ("past", "fleet") else task.runs
-    clean = (
-        recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)[0] if wrong else None
-    )
+    clean: Recording | None = None
+    if sensors.outliers or task.attack.share:
+        runs = FEW if information in ("past", "fleet") else task.runs
+        clean, _ = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)
     if information == "fleet":
         bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, list(task.columns)], 1, 0)]
     else:
@@ -213,8 +212,7 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in assumed.items() if name in own})  # type: ignore[type-var]
-    who = [k for k in range(len(recording.ids)) if k not in recording.landmarks]
-    ids = [recording.ids[k] for k in who]
+    ids = [name for k, name in enumerate(recording.ids) if k not in recording.landmarks]
     made(recording.between(0, 3), ids)  # compiles
     track = made(recording, ids)
     blocks = partial(blocks_of, start=start, length=block_s / fleet.dt)
@@ -225,7 +223,7 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
         row["heading_deg"] = round(float(np.nanmean(np.rad2deg(blocks(heading_error(track, fleet)[0])))), 3)
         row["nees"] = round(np.nanmean(pose_nees(track, fleet)[0, start:]), 2)
     row["received_bytes_per_second"] = received(track, recording, made)
-    row["microseconds_per_step"] = round(1e6 * track.seconds / len(recording.t) / len(who), 2)
+    row["microseconds_per_step"] = round(1e6 * track.seconds / len(recording.t) / len(ids), 2)
     return row
 
 
