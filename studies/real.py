@@ -201,9 +201,8 @@ def _caption(results: Results, text: str) -> str:
 
 
 def _run(results: Results, axis: str) -> list[int]:
-    """The numbers of neighbours or of landmarks that were run with one state; none without."""
-    rows = results.select(BASE) if "method" in results.frame else results.frame
-    return sorted(rows[axis].unique().tolist()) if axis in rows else []
+    """The numbers of neighbours or of landmarks that were run."""
+    return sorted({*results.frame.get(axis, ())})
 
 
 def _table(results: Results, value: str, text: str, **options: Any) -> Table | None:
