@@ -87,7 +87,7 @@ def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
     return {**look_of, "label": text}  # legends of matplotlib's own leave it out
 
 
-def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str]) -> None:
+def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None) -> None:
     """Draw the legend at the right: one entry per method and bound, and one per line style where noise models differ.
 
     Args:
@@ -102,7 +102,7 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
     styles: dict[Any, list[str]] = {}
     for names in lines:
         method, model = name_of(names), str(names.get("noise_model", "none"))
-        text = look(method).label + words.get(method, "")
+        text = look(method).label + (words or {}).get(method, "")
         if method == "bound":
             text += f", {model}" if len(bounds) > 1 else ""
         elif "method" in names and model != "none" and model not in styles.setdefault(line(model), []):
