@@ -4,7 +4,7 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from coopoc import InputError, Method, paired_difference
 from coopoc.arrays import number
 from coopoc.errors import said, unknown
 from coopoc.evaluate.scores import scored
-from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.plugins import find, in_file
 from coopoc.study.numbers import three
@@ -26,10 +25,13 @@ from coopoc.workers import progress_bar
 
 from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
+from .pose_drives import POSES
 from .roads import PUBLISHED, ROADS, holds, road_row, roads
-from .tasks import LOGGED, POSES, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
-from .worlds_card import card_file, card_folder, card_head, markdown, overview, run_worlds
+from .tasks import LOGGED, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
+from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 
+NAMES = [task.name for task in TASKS]
+"""Of the simulated tasks."""
 USUAL = "cooperative-filter"
 """Of which others are shown to be better or worse on the same blocks of real measurements."""
 
@@ -71,6 +73,8 @@ def benchmark(
         jobs: processes that run worlds.
         table: print the table of all cards in the folder, best first.
     """
+    if not methods and (worlds or not table):
+        raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
     if worlds:
         if tasks or data:
             allowed = "must stand without --tasks and --data"
@@ -80,28 +84,23 @@ def benchmark(
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         by_name = {name: replace(task, seed=drawn) for name, task in by_name.items()}
-    real = [*LOGGED, *roads(data), *CONVOYS]
+    every = (*by_name, *LOGGED, *roads(data), *CONVOYS)
     for name in tasks:
-        if name not in (*by_name, *real):
-            raise unknown("tasks", name, [*by_name, *real], "Leave it out for all.")
-    if not methods and not table:
-        raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
+        if name not in every:
+            raise unknown("tasks", name, every, "Leave it out for all.")
     for name in methods:
-        if simulated(name):
-            named_method(name)
-        elif data is None and not tasks:
-            hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
-            raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
-        own_tasks = [*(by_name if simulated(name) else ()), *measurable(name, data)]
+        own_tasks = runnable(name, by_name, data)
         if tasks and not set(tasks) & {*own_tasks}:
             raise InputError(f"tasks of {name}", ", ".join(tasks), f"must be of {', '.join(own_tasks)}", "Name one.")
+        if data is None and not tasks and not simulated(name):
+            hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
+            raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
     failed = 0
     for name in methods:
         began = time.perf_counter()
-        chosen = [by_name[task] for task in tasks or by_name if task in by_name] if simulated(name) else []
-        made = card(name, chosen, data, [task for task in tasks if task in real] if tasks else None)
+        made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
-        file = card_folder(out, seed, validation) / card_file(name)
+        file = card_file(name, out, seed, validation)
         file.write_text(json.dumps(made, indent=1) + "\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
         print(page([made]))
@@ -130,28 +129,29 @@ def tried(name: str, task: Task) -> Row:
     measured, fleet = recording(task, held in ("", "fleet"))
     one(measured.between(0, 3), [task.columns[0]])  # compiles
     scores = scored(one, measured, [fleet.ids[k] for k in task.columns], fleet)
-    level = mean_interval(scores["rt_le_m"])
-    row: Row = {"task": task.name}
-    row |= {"rt_le_m": rounded(level)}
+    row: Row = {"task": task.name, "rt_le_m": rounded(scores["rt_le_m"])}
     if held:
         least = bound(task, held)
-        rms = float(np.sqrt(np.mean(scores["rt_le_m"] ** 2)))
+        rms = np.sqrt(np.mean(scores["rt_le_m"] ** 2))
         row |= {"bound_m": round(least, 4), "information": held, "over_bound": round(rms / least, 3)}
     if "nees_inside" in scores:
-        row["nees_inside"] = round(float(scores["nees_inside"].mean()), 3)
-    row["received_bytes_per_second"] = round(float(scores["bytes_per_second"].mean()))
-    row["microseconds_per_step"] = round(1e6 * float(scores["seconds"].mean()) / len(fleet.t), 2)
+        row["nees_inside"] = round(scores["nees_inside"].mean(), 3)
+    row["received_bytes_per_second"] = round(scores["bytes_per_second"].mean())
+    row["microseconds_per_step"] = round(1e6 * scores["seconds"].mean() / len(fleet.t), 2)
     return row
 
 
-def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
-    """The tasks of real measurements for a name, and what runs each: logs for a pose filter, roads and
-    convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
+def runnable(name: str, drawn: Mapping[str, Task], data: Path | None) -> dict[str, Callable[[], Row]]:
+    """The tasks of a name, and what runs each: logs for a pose filter, simulated ones, roads and convoys for any other;
+    of "mine.py:NAME" simulated ones and logs, or roads if it says `roads = True`."""
+    rows: dict[str, Callable[[], Row]] = {}
+    if simulated(name):
+        rows = {task: partial(tried, name, one) for task, one in drawn.items()}
     if name in POSES or (in_file(name) and not _on_roads(name)):
         made = own(name) if in_file(name) else name
-        return {task: partial(pose_row, task, data, made) for task in LOGGED}
+        return rows | {task: partial(pose_row, task, data, made) for task in LOGGED}
     method, places = named_method(name), roads(data)
-    rows: dict[str, Callable[[], Row]] = {task: partial(road_row, task, data, method) for task in places}
+    rows |= {task: partial(road_row, task, data, method) for task in places}
     if places.keys() >= ROADS.keys():
         rows |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
     return rows
@@ -174,24 +174,23 @@ def _on_roads(name: str) -> bool:
     return in_file(name) and getattr(find("coopoc.methods", name), "roads", False)
 
 
-def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Sequence[str] | None = None) -> Row:
+def card(name: str, drawn: Mapping[str, Task], data: Path | None = None, tasks: Sequence[str] = ()) -> Row:
     """The card of a method: what it is, with which versions, and a row for each task.
 
     Args:
         name: of a method or a pose filter, or "mine.py:NAME".
-        tasks: simulated ones.
+        drawn: simulated tasks by name.
         data: folder of the real measurements, or None.
-        real: tasks of real measurements; None for all that there are for the name, none without data.
+        tasks: those that are run; by default all that there are for the name, without data the simulated ones.
     """
-    bar = progress_bar(list(tasks), desc=name, unit="task", delay=2.0)
-    rows = [_row(task.name, partial(tried, name, task)) for task in bar]
-    if data or real is not None:
-        for task, run in progress_bar(measurable(name, data).items(), name, delay=2.0):
-            if real is None and data and task in PUBLISHED and not holds(data, task):
-                print(f"coopoc: {task} is left out: no {PUBLISHED[task][0]} below {data}", file=sys.stderr)
-                continue
-            rows += [_row(task, run)] if real is None or task in real else []
-    return {**card_head(name), "tasks": rows}
+    chosen = dict[str, Callable[[], Row]]()
+    for task, run in runnable(name, drawn, data).items():
+        if data and not tasks and task in PUBLISHED and not holds(data, task):
+            print(f"coopoc: {task} is left out: no {PUBLISHED[task][0]} below {data}", file=sys.stderr)
+        elif task in tasks or (not tasks and (data or task in drawn)):
+            chosen[task] = run
+    bar = progress_bar(chosen.items(), name, unit="task", delay=2.0)
+    return {**card_head(name), "tasks": [_row(task, run) for task, run in bar]}
 
 
 def page(cards: Iterable[Params]) -> str:
@@ -205,15 +204,16 @@ def page(cards: Iterable[Params]) -> str:
 
 def _logs(cards: Sequence[Params]) -> list[Row]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
+    each = [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] not in NAMES]
+    usual = {row["task"]: row for one, row in each if one == USUAL}
     rows = []
-    simulated_tasks = {task.name for task in TASKS}
-    for one, row in _rows(cards, {row["task"] for card in cards for row in card["tasks"]} - simulated_tasks):
+    for one, row in each:
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
             if own := row.get("calibrated_m"):
                 shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own))
-            rival = next((held for _, held in _rows([c for c in cards if c["method"] == USUAL], {row["task"]})), {})
+            rival = usual.get(row["task"], {})
             for key, word in (("blocks_m", ""), ("calibrated_blocks_m", ", calibrated")):
                 if one != USUAL and len(row.get(key, ())) == len(rival.get(key, "-")):
                     shown[f"less {USUAL}{word} [m]"] = str(paired_difference(np.array(row[key]), np.array(rival[key])))
@@ -223,21 +223,17 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
 
 
-def _rows(cards: Sequence[Params], tasks: set[str]) -> list[tuple[str, Params]]:
-    return [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] in tasks]
-
-
 def _simulated(cards: Sequence[Params]) -> list[Row]:
     rows = []
     for one in cards:
-        cells = {row["task"]: row for _, row in _rows([one], {task.name for task in TASKS})}
+        cells = {row["task"]: row for row in one["tasks"] if row["task"] in NAMES}
         if not cells:
             continue
         errors = [row["rt_le_m"][0] for row in cells.values() if "rt_le_m" in row]
-        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(TASKS) else np.inf
+        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(NAMES) else np.inf
         paper = cells.get("paper", {})
         shown = {"method": one["method"], "mean": three(mean) if np.isfinite(mean) else "-"}
-        shown |= {task.name: _cell(cells[task.name]) if task.name in cells else "" for task in TASKS}
+        shown |= {task: _cell(cells[task]) if task in cells else "" for task in NAMES}
         shown |= {"NEES inside": paper.get("nees_inside", ""), "B/s": paper.get("received_bytes_per_second", "")}
         rows.append((mean, shown | {"us/step": paper.get("microseconds_per_step", "")}))
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]

@@ -3,19 +3,16 @@
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Where, across, difference, interval, mean, present
+from coopoc.study.numbers import Results, Where, across, difference, interval, mean, present
 from coopoc.study.style import look
 from coopoc.world.channels import CHANNELS
 
 from . import lineup, scene
 from .lineup import PAST
-from .views import of, selections
+from .views import Plot, of, selections
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from coopoc import Results
-    from coopoc.study.figures import Plot
 
 TRAINED = ("fedokf", "fedkalmannet")
 """Trained by federation, in the order of their bytes."""
@@ -68,7 +65,7 @@ def _grid() -> list[Where]:
     ]
 
 
-def _figure(results: "Results") -> "Plot | None":
+def _figure(results: Results) -> "Plot | None":
     from coopoc.study import figures
 
     where = present(results, {"channel": "ideal"})
@@ -82,7 +79,7 @@ def _figure(results: "Results") -> "Plot | None":
     return figures.pareto(results, scene.caption(results, text), PAYLOAD, where=where)
 
 
-def choices(results: "Results") -> "pd.DataFrame":
+def choices(results: Results) -> "pd.DataFrame":
     """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel."""
     rows, names = results.frame, [*AXES, "method", "noise_model"]
     if not {*names, PAYLOAD} <= set(rows):
@@ -91,7 +88,7 @@ def choices(results: "Results") -> "pd.DataFrame":
     return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
 
 
-def _findings(results: "Results") -> dict[str, str]:
+def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
     for limit in LIMITS if len(each) else ():
         if len(within := each[each[PAYLOAD] <= limit]):
@@ -103,7 +100,7 @@ def _findings(results: "Results") -> dict[str, str]:
     return texts
 
 
-def _rate(results: "Results", where: Where, value: str = PAYLOAD) -> int | None:
+def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
     rate = mean(results, where, value)
     return None if rate is None else round(rate)
 

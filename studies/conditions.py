@@ -3,18 +3,15 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from coopoc import Study
-from coopoc.study.numbers import Number, Where, across, listed, mean, ran, rms
+from coopoc.study.numbers import Number, Results, Where, across, listed, mean, ran, rms
 from coopoc.study.style import Panel, look
 
 from . import lineup, scene
 from .lineup import BOUND, PAST
 from .views import curves, of, selections
-
-if TYPE_CHECKING:
-    from coopoc import Results
 
 KALMAN, NET = ("kalman", "nominal"), ("fedkalmannet", "trained")
 COOPERATIVE, JOINT, SPLIT, LKF = ((m, "nominal") for m in ("cooperative-filter", "joint", "split-ci", "lkf-sa"))
@@ -24,8 +21,7 @@ STAR = ("bound", "star")
 
 def labelled(*pairs: tuple[str, str]) -> dict[str, Where]:
     """Label -> selection of each method under its noise model; a bound has the name of its information set."""
-    named = {(m, k): f", {k}" * (m == "bound" != k) for m, k in pairs}
-    return {look(method).label + more: of(method, model) for (method, model), more in named.items()}
+    return {look(m).label + (f", {k}" if m == "bound" and k != "bound" else ""): of(m, k) for m, k in pairs}
 
 
 def study(
@@ -52,7 +48,7 @@ def study(
     """
     methods, rows = labelled(*pairs), [((title,), case) for title, case in cases.items()]
 
-    def findings(results: "Results") -> dict[str, str]:
+    def findings(results: Results) -> dict[str, str]:
         texts = {}
         for title in named:
             each = ran({label: number(results, {**cases[title], **line}) for label, line in methods.items()})

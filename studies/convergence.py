@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,16 +10,12 @@ from coopoc import rt_le
 from coopoc.arrays import Floats
 from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval
-from coopoc.study.numbers import Where, present, seed_means
+from coopoc.study.numbers import Results, Where, mean, ran, seed_means
 from coopoc.study.study import Params, Row
 from coopoc.study.style import CLIENTS, Panel, look
 
 from . import lineup, scene, weights
-from .views import curves, table
-
-if TYPE_CHECKING:
-    from coopoc import Results
-    from coopoc.study.plot import Plot
+from .views import Plot, curves, table
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
 BOTH = {"method": [FEDERATED, CENTRALISED]}
@@ -64,21 +60,20 @@ def meaningful(p: Params) -> bool:
     return p["train_seed"] in weights.seeds(p) and weights.trainable(p)
 
 
-def _curve(results: "Results", method: str) -> list[float]:
+def _curve(results: Results, method: str) -> list[float]:
     """Mean RT-LE after every round; empty if the net was not run."""
-    where = present(results, {"method": method})
-    rounds = sorted(results.select(where)["round"].unique()) if where else []
-    return [results.interval("rt_le_m", method=method, round=number).mean for number in rounds]
+    rounds = sorted({*results.frame.get("round", ())})
+    return [*ran({number: mean(results, {"method": method, "round": number}) for number in rounds}).values()]
 
 
-def _seeds(results: "Results", where: Where) -> Interval | None:
+def _seeds(results: Results, where: Where) -> Interval | None:
     """Mean over training seeds, with the lowest and the highest of them."""
     each = seed_means(results, where)
     return Interval(sum(each) / len(each), min(each), max(each), len(each)) if each else None
 
 
-def _figure(results: "Results") -> "Plot | None":
-    rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else ()
+def _figure(results: Results) -> "Plot | None":
+    rounds = sorted({*results.frame.get("round", ())})
     ticks = {number: str(number) for number in rounds if number % 5 == 0}
     panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round", ticks=ticks)
     text = (
@@ -93,11 +88,11 @@ def _figure(results: "Results") -> "Plot | None":
     return curves([panel], lines, text, number=_seeds, levels=ends, width=6.4, log=True)(results)
 
 
-def _clients(results: "Results") -> "Plot":
+def _clients(results: Results) -> "Plot":
     """The path of each client on one scale, with its number of steps and its range of speeds (paper, Fig. 2)."""
     from coopoc.study.plot import Plot, canvas
 
-    drives: Any = weights.drives(str(results.settings["clients"]))
+    drives: Any = weights.drives(results.settings["clients"])
     truth, shown = getattr(drives, "truth", drives), list(zip(range(1, 7), drives.ids, CLIENTS, strict=False))
     same = {"squeeze": False, "sharex": True, "sharey": True}
     with canvas(1, len(shown), width=2.0 * len(shown) + 0.4, height=2.6, **same) as (figure, (panels,)):
@@ -113,7 +108,7 @@ def _clients(results: "Results") -> "Plot":
     return Plot(figure, f"Paths of the clients of {truth.name} from the dot on, steps of {truth.dt:g} s; their speeds.")
 
 
-def _findings(results: "Results") -> dict[str, str]:
+def _findings(results: Results) -> dict[str, str]:
     fed, centralised = _curve(results, FEDERATED), _curve(results, CENTRALISED)
     texts = {}
     if fed and centralised:

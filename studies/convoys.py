@@ -9,7 +9,6 @@ import numpy as np
 
 from coopoc import V2X, Fleet, Method, Recording, observe
 from coopoc.arrays import AnyArray, Floats
-from coopoc.evaluate.statistics import mean_interval
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 
@@ -103,10 +102,9 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     gap, nees = planar(track, fleet)
     size = min(BLOCK, len(recording.t) * recording.dt / 4) / recording.dt
     blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
-    level = mean_interval(blocks.T)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
-    row |= {"rt_le_m": rounded(level), "blocks_m": [round(float(value), 4) for value in blocks.ravel()]}
+    row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}
     if track.covariance is not None:
-        row["nees"] = round(float(np.nanmean(nees)), 2)
-    row["received_bytes_per_second"] = received(track, recording, method.message)
+        row["nees"] = round(np.nanmean(nees), 2)
+    row["received_bytes_per_second"] = received(track, recording, method)
     return row | {"microseconds_per_step": round(1e6 * track.seconds / track.x[..., 0].size, 2)}

@@ -1,19 +1,16 @@
 """Learned gains among themselves and against fair filters: the distribution of the error (paper, Fig. 4)."""
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, seed_std, verdict
+from coopoc.study.numbers import Number, Results, Where, interval, listed, mean, present, seed_std, verdict
 from coopoc.study.study import Params
-from coopoc.study.style import Panel
+from coopoc.study.style import Panel, look
 
 from . import lineup, scene, weights
-from .views import HEAD, FigureView, TableView, curves, labelled, of, selections
-
-if TYPE_CHECKING:
-    from coopoc import Results
+from .views import FigureView, TableView, curves, of, selections
 
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
@@ -45,10 +42,11 @@ COLUMNS: dict[str, Number] = {
 
 def _table(at: Params) -> TableView:
     text = "Errors over all steps; maximum: the mean of the largest of each run."
-    return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
+    rows = [((look(method).label, model), of(method, model, **at)) for method, model in LINEUP]
+    return selections(("Method", "Noise model"), rows, COLUMNS, text, at=at)
 
 
-def quantile(results: "Results", where: Where) -> float | None:
+def quantile(results: Results, where: Where) -> float | None:
     """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
     kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
     if kept is None:
@@ -65,7 +63,7 @@ def _cdf(at: Where) -> FigureView:
     )
 
 
-def _finding(results: "Results", at: Params) -> str:
+def _finding(results: Results, at: Params) -> str:
     """RT-LE in a case, and the verdict on the federated net; nothing where nothing was run."""
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     means = {words: mean(results, {**at, "method": name}) for words, name in names.items()}

@@ -28,32 +28,27 @@ PAST = ("bound", "with its past")
 """The bound of a star whose newcomers bring what they did before, as messages with estimates or sums do."""
 
 
-def study(name: str, question: str, settings: Params, scored: bool = True, **options: Any) -> Study:
+def study(name: str, question: str, scored: bool = True, **options: Any) -> Study:
     """A study of methods: cells, keys, training and reference values as most studies have them, but for the options.
 
     Args:
         name: of the study.
         question: that it answers.
-        settings: of its cells.
         scored: whether its rows come from `rows`, to which the setting `metric` adds a column.
         options: other fields of Study.
     """
-    settings = {**settings, "metric": ""} if scored else settings
+    if scored:
+        options["settings"] = {**options["settings"], "metric": ""}
     usual = {
-        "settings": settings,
         "cell": cell,
         "tracks": None if "cell" in options else tracks,
         "key": key,
         "prepare": weights.prepare,
         "recipe": weights.described,
         "idle": scene.idle,
+        "reference": Path(__file__).parent / "reference" / f"{name}.json",
     }
-    return Study(name, question, **{**usual, "reference": reference(name), **options})
-
-
-def reference(name: str) -> Path:
-    """File of a study's reference values."""
-    return Path(__file__).parent / "reference" / f"{name}.json"
+    return Study(name, question, **{**usual, **options})
 
 
 def cell(p: Params) -> list[Row]:
@@ -88,7 +83,7 @@ def noise_model(p: Params) -> "NoiseModel | str":
     from coopoc import NoiseModel
 
     if p["noise_model"] == "fitted":
-        return weights.fitted(p)
+        return weights.fitted(p["clients"], p["velocity_reading"])
     if p["noise_model"] == "oracle":
         if scene.is_real(p["data"]):
             hint = "Take nominal or fitted on real data."
@@ -105,8 +100,7 @@ def methods(p: Params) -> "list[tuple[int | None, Method]]":
     """
     name, first = p["method"], start(p)
     if weights.is_trained(name):
-        models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
-        return [(seed, model.method(name, first)) for seed, model in models]
+        return [(seed, weights.checkpoint(name, p, seed).model.method(name, first)) for seed in weights.seeds(p)]
     method = own(name, noise_model(p))
     if hasattr(method, "x0"):
         method = replace(method, x0=first)
@@ -175,7 +169,7 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
     from coopoc.evaluate.scores import rows_of, scored
     from coopoc.methods.catalogue import METHODS
 
-    (recording, who, drive), metric = scene.trial(p), str(p.get("metric", ""))
+    (recording, who, drive), metric = scene.trial(p), p.get("metric", "")
     table: list[Row] = []
     strange = p["method"] not in METHODS and not weights.is_trained(p["method"])
     for seed, method in methods(p):
@@ -193,21 +187,21 @@ def bound_rows(p: Params) -> list[Row]:
     none: the bound is of sensors that measure at every step.
     """
     from coopoc import bound_rt_le, posterior_bound
-    from coopoc.evaluate.bounds import past_bound
 
-    bound = posterior_bound if p.get("noise_model") in ("bound", "star") else past_bound
+    past = p.get("noise_model") not in ("bound", "star")
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p)]
-    acting, rate, clean = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt), scene.without_outliers(p)
+    acting, rate = scene.sensors(p), min(v2x.rate or np.inf, 1 / drive.dt)
+    clean = scene.recording(p, remove_outliers=True) if acting.outliers or scene.attacking(p) else None
     rows_of_egos: list[Row] = []
     for ego in scene.egos(p):
         column = drive.index(ego)
-        level = bound_rt_le(bound(drive, acting, column, v2x, recording=clean))
+        level = bound_rt_le(posterior_bound(drive, acting, column, v2x, past=past, recording=clean))
         near = len(find_links(drive, [column], v2x, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
-        sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
-        rows_of_egos.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
+        row: Row = {"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near}
+        rows_of_egos.append(row | {"bytes_per_second": received, "payload_bytes_per_second": received})
     return rows_of_egos
 
 

@@ -1,19 +1,14 @@
 """Collaborative training against collaborative decision: RT-LE against neighbours (paper, Fig. 5)."""
 
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from coopoc.study.numbers import Where, interval, listed, mean, present, rms
+from coopoc.study.numbers import Results, Where, interval, listed, mean, present, rms
 from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
 from . import lineup, scene
 from .lineup import BOUND
-from .views import curves, of, table
-
-if TYPE_CHECKING:
-    from coopoc import Results
-    from coopoc.study.figures import Plot
+from .views import Plot, TableView, curves, of, table
 
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
 TRAINED = ("okf", "fedkalmannet", "centralised")
@@ -37,16 +32,16 @@ def _meaningful(p: Params) -> bool:
     )
 
 
-def _under(noise_model: str) -> dict[str, Any]:
-    """Cells with a noise model, and those of methods that have none."""
-    return {"noise_model": [noise_model, "none", "trained", "bound"]}
-
-
 BOUND_NOTE = "The bound is for the rms over runs of causal estimates, over an ideal channel and without the bias."
-k_table = partial(table, intervals=False)
 
 
-def _sides(results: "Results") -> "Plot | None":
+def _table(noise_model: str) -> TableView:
+    """RT-LE of cells with a noise model, and of those of methods that have none."""
+    text, where = f"RT-LE [m] against K, {noise_model} noise model.", [noise_model, "none", "trained", "bound"]
+    return table(text, BOUND_NOTE, where={"noise_model": where}, intervals=False)
+
+
+def _sides(results: Results) -> "Plot | None":
     """Training against cooperation: identity covariances on the left, fitted ones on the right."""
     x = {k: {"max_neighbours": k} for k in NEIGHBOURS}
     panels = [
@@ -63,11 +58,11 @@ def _sides(results: "Results") -> "Plot | None":
     return curves(panels, [*solo, *shared, of(*BOUND)], text, BOUND_NOTE, **options)(results)
 
 
-def _interval(results: "Results", where: Where) -> Any:
+def _interval(results: Results, where: Where) -> Any:
     return (mean if where["method"] == "bound" else interval)(results, where)
 
 
-def findings(results: "Results") -> dict[str, str]:
+def findings(results: Results) -> dict[str, str]:
     """Which of training and cooperation is better, and the errors under known covariances beside the bound."""
     k = _most(results, "nominal")
     pairs = {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND}
@@ -76,7 +71,7 @@ def findings(results: "Results") -> dict[str, str]:
     return {"answer": _answer(results), "nominal": text if each else ""}
 
 
-def _answer(results: "Results") -> str:
+def _answer(results: Results) -> str:
     """Which of the two is better at the largest K, with fitted covariances and with the paper's."""
     k = _most(results, "fitted")
     fed, joint, paper = (
@@ -92,7 +87,7 @@ def _answer(results: "Results") -> str:
     )
 
 
-def _most(results: "Results", noise_model: str) -> int:
+def _most(results: Results, noise_model: str) -> int:
     """The largest K at which a cooperative method was run with this noise model; 0 for none."""
     where = present(results, {"method": list(lineup.COOPERATIVE), "noise_model": noise_model})
     return int(results.select(where)["max_neighbours"].max()) if where else 0
@@ -110,12 +105,7 @@ STUDY = lineup.study(
         "train_seeds": 5,
     },
     shares=("max_neighbours",),
-    tables={
-        **{
-            f"rt_le_{model}": k_table(f"RT-LE [m] against K, {model} noise model.", BOUND_NOTE, where=_under(model))
-            for model in ("identity", "fitted", "nominal")
-        },
-    },
+    tables={f"rt_le_{model}": _table(model) for model in ("identity", "fitted", "nominal")},
     figures={"rt_le": _sides},
     findings=findings,
     limitations=(

@@ -1,9 +1,11 @@
 """Real drives whose headings are estimated: measurements, first poses, truth, and the part that is scored."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,14 @@ LONGEST, SHARE = 300.0, 0.4
 BLOCK, BLOCKS = 30.0, 4
 """s of a block of time, and the least number of blocks, where the settings leave it open."""
 
+POSES: Mapping[str, Mapping[str, Any]] = {
+    "pose-solo": {"unit": "solo"},
+    "pose-plain": {"unit": "solo", "exact": False, "robust": False, "lasting": False},
+    "pose-fleet": {"unit": "fleet"},
+    "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
+    "pose-naive": {"unit": "fleet", "fusion": "naive"},
+}
+"""Pose filters by name: their options."""
 GATE = 5.0
 """Standard deviations, of all pose filters."""
 
@@ -59,7 +69,7 @@ def calibrated(p: Params) -> float:
     Raises:
         InputError: nothing is left to be scored.
     """
-    seconds = length(str(p["data"]))
+    seconds = length(p["data"])
     until = min(LONGEST, SHARE * seconds) if p["calibrate_s"] is None else float(p["calibrate_s"])
     if not 0 <= until < seconds:
         allowed = f"must be 0 or more and end before the drive, {seconds:g} s"
@@ -69,7 +79,7 @@ def calibrated(p: Params) -> float:
 
 def block(p: Params) -> float:
     """s of a block of time, which errors are averaged over: set, else 30 s, a quarter of the rest at most."""
-    left = length(str(p["data"])) - calibrated(p)
+    left = length(p["data"]) - calibrated(p)
     return min(BLOCK, left / BLOCKS) if p["block_s"] is None else float(p["block_s"])
 
 

@@ -1,19 +1,18 @@
 """Real vehicles with nothing simulated: when does a neighbour replace a landmark, such as a road-side unit?"""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from coopoc import V2X, Fleet, InputError, PoseFilter, Recording, Sensors, Study, Track, heading_error, pose_nees
 from coopoc.arrays import Floats
 from coopoc.data.source import split
-from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, fix_innovations
-from coopoc.study.numbers import Where, across, difference, interval, mean, present, ran
+from coopoc.evaluate.scores import online_columns
+from coopoc.study.numbers import Results, Where, across, difference, interval, mean, present, ran
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel, look, words
@@ -22,21 +21,14 @@ from coopoc.study.tables import Table, crossed, unused
 from . import pose_drives as drives
 from .pose_drives import Drive, thinned
 from .scene import CODE
+from .views import Plot
 
-if TYPE_CHECKING:
-    from coopoc import Results
-    from coopoc.study.figures import Plot
-
-METHODS: Mapping[str, Mapping[str, Any]] = {
-    "pose-fleet": {},
-    "pose-intersection": {"fusion": "intersection"},
-    "pose-naive": {"fusion": "naive"},
-}
-"""Pose filters of a fleet in body frames: their options."""
+FLEET, *DECENTRALISED = METHODS = ("pose-fleet", "pose-intersection", "pose-naive")
+"""Pose filters of a fleet in body frames."""
 ALONE, FEDERATED, CENTRAL = TRAINED = ("trained-alone", "trained-federated", "trained-centralised")
 """One state or a solo filter whose constants are learned on the first part: from a vehicle's own measurements, as the
 mean of the logarithms of all vehicles, from all measurements at once."""
-BASE = {"method": "pose-fleet"}
+BASE = {"method": FLEET}
 """The filter that is run with neighbours and without, with the noise as it is assumed."""
 EVERY = (*METHODS, *TRAINED)
 LANDMARKS, NEIGHBOURS = (0, 1, 2, 4, 15), (0, 1, 2, 3, 4)
@@ -63,7 +55,7 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
             drive = drives.drive(data, until, near(k))
             for landmarks in dict.fromkeys(min(n, marks) for n in TRAINING):
                 part = thinned(drive.recording, landmarks, settled).between(0, steps)
-                tasks.append(PoseTask(part, truth, egos, _filter({}, k, drive), settled))
+                tasks.append(PoseTask(part, truth, egos, _filter(FLEET, k, drive), settled))
         return fit_pose_noise(tasks, first.sensors, evaluations)
 
     own, whole = [fitted((name,), 0) for name in alone.ids], fitted(alone.ids, *_ends(vehicles))
@@ -81,7 +73,7 @@ def near(k: int, loss: float = 0.0) -> V2X:
 
 def channel(p: Params) -> V2X:
     """The channel of a cell."""
-    return near(int(p["max_neighbours"]), float(p["loss"]))
+    return near(p["max_neighbours"], p["loss"])
 
 
 def key(p: Params) -> dict[str, str]:
@@ -92,14 +84,14 @@ def key(p: Params) -> dict[str, str]:
     """
     if p["method"] not in EVERY:
         raise InputError("method", p["method"], f"must be among {list(EVERY)}", "Name one of them.")
-    drives.check(str(p["data"]), drives.calibrated(p))
+    drives.check(p["data"], drives.calibrated(p))
     channel(p)
-    return {"code": revision(*CODE), **drives.digests(str(p["data"]))}
+    return {"code": revision(*CODE), **drives.digests(p["data"])}
 
 
 def applies(p: Params) -> bool:
     """Whether the data has so many vehicles and landmarks, and the method needs what there is."""
-    k, n, method, data = int(p["max_neighbours"]), int(p["landmarks"]), p["method"], str(p["data"])
+    k, n, method, data = p["max_neighbours"], p["landmarks"], p["method"], p["data"]
     if not Path(split(data)[0]).exists():
         return True  # the key names what is wrong
     vehicles, marks = drives.counts(data)
@@ -107,7 +99,7 @@ def applies(p: Params) -> bool:
     if method in TRAINED:
         taught = drives.calibrated(p) > 0 and drives.has_true_poses(data)
         return fits and taught and (k == 0 or (method == CENTRAL and k in _ends(vehicles)))
-    return fits and not (k == 0 and METHODS.get(method))
+    return fits and not (k == 0 and method in DECENTRALISED)
 
 
 def _ends(vehicles: int) -> tuple[int, int]:
@@ -118,49 +110,46 @@ def _ends(vehicles: int) -> tuple[int, int]:
 def cell(p: Params) -> list[Row]:
     """Rows of one number of neighbours and landmarks: a vehicle and a block of time each."""
     until = drives.calibrated(p)
-    drive = drives.drive(str(p["data"]), until, channel(p))
+    drive = drives.drive(p["data"], until, channel(p))
     dt, (filters, once) = drive.recording.dt, _filters(p, drive)
     start, block = int(until / dt), max(int(drives.block(p) / dt), 1)
-    recording = thinned(drive.recording, int(p["landmarks"]), start)
+    recording = thinned(drive.recording, p["landmarks"], start)
     blocks = max((len(recording.t) - start) // block, 1)
     rows: list[Row] = []
     for who in [(name,) for name in drive.ids] if len(filters) > 1 else [drive.ids]:
         method = filters[drive.ids.index(who[0]) % len(filters)]
         track = method(recording, who)
-        account = of_track(track, recording, method.message)
-        ways = (account.of("online", "on air", way)[0] for way in ("broadcast", "per receiver"))
-        sent, received = (moved / account.seconds for moved in ways)
+        online = online_columns(track, recording, method)
         scores = _scores(track, recording, drive.truth)
         finite = np.isfinite(next(iter(scores.values()), np.empty((0, len(who)))))[start : start + blocks * block]
         for ego, name in enumerate(who):  # as many blocks for each vehicle, of the steps at which it can be scored
             for number, scored in enumerate(np.array_split(start + np.flatnonzero(finite[:, ego]), blocks)):
                 columns = {what: _reduced(what, score[scored, ego]) for what, score in scores.items()}
                 if any(np.isfinite(value) for value in columns.values()):
-                    sizes = {"bytes_per_second": received[ego], "sent_bytes": once + sent[ego] * driven(p)}
-                    rows.append({"run": number, "ego": name, **columns, **sizes})
+                    columns["bytes_per_second"] = online["bytes_per_second"][0, ego]
+                    columns["sent_bytes"] = once + online["sent_bytes_per_second"][0, ego] * driven(p)
+                    rows.append({"run": number, "ego": name, **columns})
     return rows
 
 
 def driven(p: Params) -> float:
     """s of the drive that the bytes are for: set, else the part that is scored."""
-    left = drives.length(str(p["data"])) - drives.calibrated(p)
+    left = drives.length(p["data"]) - drives.calibrated(p)
     return left if p["drive_s"] is None else float(p["drive_s"])
 
 
 def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
     """One filter for all vehicles or one for each, and bytes that a vehicle sent for its training."""
-    data_and_calibration = str(p["data"]), drives.calibrated(p), int(p["evaluations"])
-    name, k = str(p["method"]), int(p["max_neighbours"])
-    constants, once = trained(*data_and_calibration)[name] if name in TRAINED else ([None], 0.0)
-    made = _filter(METHODS.get(name, {}), k, drive)
+    name, constants, once = p["method"], list[Any]([None]), 0.0
+    if name in TRAINED:
+        constants, once = trained(p["data"], drives.calibrated(p), p["evaluations"])[name]
+    made = _filter(FLEET if name in TRAINED else name, p["max_neighbours"], drive)
     return [replace(made, assumed=one) for one in constants], once
 
 
-def _filter(fusion: Params, k: int, drive: Drive) -> PoseFilter:
-    unit: Any = "fleet" if k else "solo"
-    return PoseFilter(
-        unit, **(fusion if k else {}), lasting=drive.lasting, gate=drives.GATE, begin=drive.begin, spread=drive.spread
-    )
+def _filter(name: str, k: int, drive: Drive) -> PoseFilter:
+    options = drives.POSES[name if k else "pose-solo"]
+    return PoseFilter(**options, lasting=drive.lasting, gate=drives.GATE, begin=drive.begin, spread=drive.spread)
 
 
 def _scores(track: Track, recording: Recording, truth: Fleet | None) -> dict[str, Floats]:
@@ -194,9 +183,9 @@ UNFIT = 100.0
 """Mean NEES of a pose that no drift explains: units, axes or noise are other ones."""
 
 
-def _caption(results: "Results", text: str) -> str:
+def _caption(results: Results, text: str) -> str:
     p = results.settings
-    data = str(p["data"])
+    data = p["data"]
     marks = drives.counts(data)[1]
     parts = [
         text,
@@ -211,15 +200,12 @@ def _caption(results: "Results", text: str) -> str:
     return " ".join(parts)
 
 
-def _numbers(results: "Results") -> tuple[list[int], list[int]]:
-    """The numbers of neighbours and of landmarks that were run with one state; none without."""
-    rows = results.select(BASE) if "method" in results.frame else results.frame
-    axes = ("max_neighbours", "landmarks")
-    ks, marks = (sorted(rows[axis].unique().tolist()) if axis in rows else [] for axis in axes)
-    return ks, marks
+def _run(results: Results, axis: str) -> list[int]:
+    """The numbers of neighbours or of landmarks that were run."""
+    return sorted({*results.frame.get(axis, ())})
 
 
-def _table(results: "Results", value: str, text: str, **options: Any) -> Table | None:
+def _table(results: Results, value: str, text: str, **options: Any) -> Table | None:
     """A metric of all methods, by K and landmarks, and the bytes that a vehicle sends."""
     if present(results, {}, value) is None:
         return None
@@ -238,32 +224,32 @@ BYTES = (
 )
 
 
-def _rows(results: "Results") -> list[tuple[tuple[int, str], Where]]:
-    ks, _ = _numbers(results)
+def _rows(results: Results) -> list[tuple[tuple[int, str], Where]]:
+    ks = _run(results, "max_neighbours")
     return [((k, look(name).label), {"method": name, "max_neighbours": k}) for k in ks for name in EVERY]
 
 
-def _columns(results: "Results") -> dict[str, Where]:
-    return {f"{words('landmarks')} = {n}": {"landmarks": n} for n in _numbers(results)[1]}
+def _columns(results: Results) -> dict[str, Where]:
+    return {f"{words('landmarks')} = {n}": {"landmarks": n} for n in _run(results, "landmarks")}
 
 
-def _sent(results: "Results", where: Where) -> int | None:
-    sent = mean(results, {"landmarks": _numbers(results)[1][-1], **where}, "sent_bytes")
+def _sent(results: Results, where: Where) -> int | None:
+    sent = mean(results, {"landmarks": _run(results, "landmarks")[-1], **where}, "sent_bytes")
     return None if sent is None else round(sent)
 
 
-def _gains(results: "Results") -> Table | None:
+def _gains(results: Results) -> Table | None:
     """Paired differences of RT-LE from the filter with the same K and the noise as assumed."""
     rows = [row for row in _rows(results) if row[1]["method"] != BASE["method"]]
 
-    def gap(results: "Results", where: Where) -> Any:
+    def gap(results: Results, where: Where) -> Any:
         return difference(results, where, {**where, **BASE})
 
     text = f"RT-LE [m] less that of {look(BASE['method']).label} with the same K, paired."
     return crossed(results, HEAD, rows, across(gap, _columns(results)), _caption(results, text), decimals=3)
 
 
-def _trade(results: "Results") -> "Plot | None":
+def _trade(results: Results) -> "Plot | None":
     """RT-LE over the bytes sent, a panel per number of landmarks; no bytes stand at the left."""
     from coopoc.study import figures
 
@@ -272,13 +258,13 @@ def _trade(results: "Results") -> "Plot | None":
     if all(where["method"] == base for where in each):
         return None
 
-    def error(results: "Results", where: Where) -> Any:
+    def error(results: Results, where: Where) -> Any:
         at = {**each[where["at"]], "landmarks": where["landmarks"]}
         kind = 0 if at["method"] == base else 2 if at["max_neighbours"] else 1
         return interval(results, at) if kind == where["kind"] else None
 
     places = {max(_sent(results, where) or 0.0, 1.0 + 0.3 * i): {"at": i} for i, where in enumerate(each)}
-    marks, ticks = [n for n in _numbers(results)[1] if n <= FEW], {1.0: "0", 1e2: "100", 1e4: "10 k", 1e6: "1 M"}
+    marks, ticks = [n for n in _run(results, "landmarks") if n <= FEW], {1.0: "0", 1e2: "100", 1e4: "10 k", 1e6: "1 M"}
     panels = [Panel(places, {"landmarks": n}, _landmarks(n), "Sent [B]", ticks) for n in marks]
     looks = ("Cooperating", "#0072B2", "s"), ("Training", "#D55E00", "o"), ("Both", "#009E73", "D")
     lines = [
@@ -290,13 +276,13 @@ def _trade(results: "Results") -> "Plot | None":
     return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 
-def _findings(results: "Results") -> dict[str, str]:
+def _findings(results: Results) -> dict[str, str]:
     """Key and sentence of what the cells show; a finding whose cells are missing is left out."""
 
     def of(k: int, n: int, value: str = "rt_le_m") -> float | None:
         return mean(results, {**BASE, "max_neighbours": k, "landmarks": n}, value)
 
-    ks, marks = _numbers(results)
+    ks, marks = _run(results, "max_neighbours"), _run(results, "landmarks")
     if not ks:
         return {}
     texts = {}

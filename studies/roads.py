@@ -12,12 +12,11 @@ from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.registry import load_log
 from coopoc.data.source import split
-from coopoc.evaluate.statistics import mean_interval
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 
 from .pose_drives import hashed
-from .tasks import located, planar, rounded
+from .tasks import blocks_of, located, planar, rounded
 
 SHARE, BLOCK = 0.4, 30.0
 """Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""
@@ -32,23 +31,23 @@ ROADS: Mapping[str, tuple[str, ...]] = {
 PUBLISHED: Mapping[str, tuple[str, ...]] = {"nclt": ("test.pt", "val.pt"), "nclt-val": ("val.pt",)}
 """Task of drives that a net was published with -> the file that is scored, with all its fixes and steps, and the one
 that calibrates."""
+EVERY_ROAD = {**ROADS, **PUBLISHED}
 STEP = 0.1
 """s, of comma2k19, whose speeds come every 0.01 s."""
 
 
 def roads(data: Path | None) -> Mapping[str, tuple[str, ...]]:
     """The tasks of a folder of data or of what was fetched, or the one of a log of one's own."""
-    every = {**ROADS, **PUBLISHED}
-    if data is None:
-        return every
-    path = Path(split(str(data))[0])
-    own = path.exists() and is_log(path) and not any(holds(path, task) for task in every)
-    return {path.stem: ()} if own else every
+    if data is not None:
+        path = Path(split(str(data))[0])
+        if path.exists() and is_log(path) and not any(holds(path, task) for task in EVERY_ROAD):
+            return {path.stem: ()}
+    return EVERY_ROAD
 
 
 def holds(path: Path, task: str) -> bool:
     """Whether the first file of a task is below a folder, or is the folder."""
-    first = {**ROADS, **PUBLISHED}[task][0]
+    first = EVERY_ROAD[task][0]
     return path.name == first or any(path.rglob(first))
 
 
@@ -127,7 +126,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
     """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
     vehicle, NEES of (x, y), us of a step."""
     blocks, ratios, seconds, axis = list[float](), list[Floats](), 0.0, dict[str, float]()
-    size = max(int(min(BLOCK / recording.dt, (len(recording.t) - start) / 4)), 1)
+    size = min(BLOCK / recording.dt, (len(recording.t) - start) / 4)
     for column in recording.observers:
         squares = np.full(len(recording.t), np.nan)
         for begin, stop in recording.stretches(column):
@@ -137,12 +136,9 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
             gap, nees = planar(track, truth.between(begin, stop))
             squares[begin:stop], seconds = np.square(gap[0, :, 0]).sum(axis=-1), seconds + track.seconds
             ratios.append(nees[0, max(start - begin, 0) :, 0])
-        parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
-        blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
+        blocks += blocks_of(np.sqrt(squares)[:, None], start, size).ravel().tolist()
         axis[recording.ids[column]] = round(float(np.sqrt(np.nanmean(squares[start:]) / 2)), 4)
-    level = mean_interval(np.array(blocks))
-    row: Row = {"rt_le_m": rounded(level), "axis_rms_m": axis}
-    row["blocks_m"] = [round(value, 4) for value in blocks]
-    nees = np.concatenate(ratios)
-    row |= {"nees": round(float(np.nanmean(nees)), 2)} if np.isfinite(nees).any() else {}
+    row: Row = {"rt_le_m": rounded(np.array(blocks)), "axis_rms_m": axis, "blocks_m": np.round(blocks, 4).tolist()}
+    if np.isfinite(nees := np.concatenate(ratios)).any():
+        row["nees"] = round(np.nanmean(nees), 2)
     return row | {"microseconds_per_step": round(1e6 * seconds / len(recording.t), 2)}

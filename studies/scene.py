@@ -73,16 +73,8 @@ def is_real(data: str) -> bool:
 @lru_cache(maxsize=4)
 def measured(data: str) -> Recording | None:
     """One run of real data with all that its vehicles measured of each other; None where that is simulated."""
-    log = _log(data)
-    if log is None:
-        return None
-    return _under(log, V2X(len(fleet(data).ids), radius=float("inf")), runs=1, seed=0)
-
-
-def _under(log: "Log", v2x: V2X, runs: int, seed: int) -> Recording:
-    from coopoc.data.log.links import under
-
-    return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
+    everyone = V2X(len(fleet(data).ids), radius=float("inf"))
+    return _recording(data, Sensors(), everyone, 1, 0, None, False) if is_real(data) else None
 
 
 def egos(p: Params) -> tuple[str, ...]:
@@ -100,15 +92,14 @@ def egos(p: Params) -> tuple[str, ...]:
         return (wanted,)
     if wanted != "auto" and not wanted.isdigit():
         return tuple(drive.ids[drive.index(i.strip())] for i in wanted.split("+" if "+" in wanted else ","))
-    there = _there(p["data"])
-    throughout = [i for column, i in enumerate(drive.ids) if there[:, column].all()]
-    somewhere = [i for column, i in enumerate(drive.ids) if (there[1:, column] & there[:-1, column]).any()]
-    if len(throughout) < (1 if wanted == "auto" else int(wanted)):
-        throughout = somewhere
-    count = min(5, len(throughout)) if wanted == "auto" else int(wanted)
-    if not 1 <= count <= len(throughout):
-        raise InputError("egos", wanted, f"must be 1..{len(throughout)}, vehicles that are there", "Take fewer.")
-    return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
+    there, ids = _there(p["data"]), np.array(drive.ids)
+    chosen = ids[there.all(axis=0)]
+    if len(chosen) < (1 if wanted == "auto" else int(wanted)):
+        chosen = ids[(there[1:] & there[:-1]).any(axis=0)]
+    count = min(5, len(chosen)) if wanted == "auto" else int(wanted)
+    if not 1 <= count <= len(chosen):
+        raise InputError("egos", wanted, f"must be 1..{len(chosen)}, vehicles that are there", "Take fewer.")
+    return tuple(chosen[np.arange(count) * len(chosen) // count].tolist())
 
 
 def _there(data: str) -> Bools:
@@ -131,19 +122,18 @@ LASTING = ("own_share", "common_share")
 
 def sensors(p: Params) -> Sensors:
     """Noise of scenario 1 or 2 of the paper, or of its training (0), with the velocity noise of the cell."""
-    ratio, reading = float(p["velocity_ratio"]), p["velocity_reading"]
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
-    noise = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
+    noise = lasting(presets[p["scenario"]](), *(p.get(name, 0.0) for name in LASTING))
     return replace(
         noise,
-        velocity_std_ratio=ratio,
-        velocity_reading=reading,
-        gnss_drift_time=float(p.get("drift_time_s", noise.gnss_drift_time)),
-        heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
-        heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
-        outliers=Outliers.named(str(p["outliers"])) if p.get("outliers") else None,
+        velocity_std_ratio=p["velocity_ratio"],
+        velocity_reading=p["velocity_reading"],
+        gnss_drift_time=p.get("drift_time_s", noise.gnss_drift_time),
+        heading_std=np.deg2rad(p.get("heading_std_deg", 0.0)),
+        heading_bias_std=np.deg2rad(p.get("heading_bias_deg", 0.0)),
+        outliers=Outliers.named(p["outliers"]) if p.get("outliers") else None,
     )
 
 
@@ -157,12 +147,6 @@ def lasting(noise: Sensors, own: float, common: float) -> Sensors:
         raise InputError(", ".join(LASTING), (own, common), "must be >= 0 and below 1 together", "0.5 is half of it.")
     white, drift, shared = (noise.gnss_std[0] * float(np.sqrt(share)) for share in (1.0 - own - common, own, common))
     return replace(noise, gnss_std=(white,) * 3, gnss_drift_std=drift, gnss_common_std=shared)
-
-
-def acting(p: Params) -> Sensors:
-    """Noise of the cell's measurements: the simulated one, or that measured of real data."""
-    real = measured(p["data"])
-    return sensors(p) if real is None else real.sensors
 
 
 def start(p: Params) -> Start:
@@ -179,7 +163,7 @@ def heading(p: Params) -> str:
     if is_real(p["data"]):
         trained = f"trained with velocity noise per {p['velocity_reading']}, " if p.get("train_seeds") else ""
         return f"Real data, {trained}{begin}"
-    noise = acting(p)
+    noise = sensors(p)
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
     between = f"range {noise.range_std:.2g} m, angles {np.rad2deg(noise.azimuth_std):.2g}°"
@@ -220,21 +204,17 @@ def idle(results: "Results") -> set[str]:
     p = results.settings
     off = {n for n, value in p.items() if value in ("", None) or (value == 0 and type(value) in (bool, float))}
     trained = {"trained", "fitted"} & {*results.frame.get("noise_model", ["trained"])}
-    drawn = () if measured(str(p["data"])) is None else ("seed", "runs", *SIMULATED)
+    drawn = ("seed", "runs", *SIMULATED) if is_real(p["data"]) else ()
     return off | set(drawn) | set(() if trained else TRAINING)
 
 
 def caption(results: "Results", *texts: str, **at: Any) -> str:
     """The texts, which may name settings in braces, and the conditions of the study, or of the selection `at` of it."""
-    p = shown(results, **at)
+    frame, p = results.frame, dict(results.settings)
+    if not ("train_seed" in frame and frame["train_seed"].notna().any()):
+        p["train_seeds"] = 0
+    p |= at
     return " ".join([*(text.format(**p) for text in texts), conditions(p)])
-
-
-def shown(results: "Results", **at: Any) -> dict[str, Any]:
-    """Parameters of results, or of a selection; training seeds only where something was trained."""
-    frame = results.frame
-    trained = "train_seed" in frame and frame["train_seed"].notna().any()
-    return {**results.settings, **({} if trained else {"train_seeds": 0}), **at}
 
 
 def _count(number: int, noun: str) -> str:
@@ -247,16 +227,14 @@ def channel(p: Params) -> V2X:
     A cap of 0 is none; a radius of 0 is 30 m, or all that a log has; a rate of 0, and None for loss, burst and
     latency, are the channel's own.
     """
-    cap = float(p.get("cap_bytes_per_second", 0.0))
-    most = int(p.get("max_neighbours", 0))
-    usual = channel_of(str(p["channel"]), most) if "channel" in p else V2X.ideal(most)
+    usual = channel_of(p.get("channel", "ideal"), p.get("max_neighbours", 0))
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
     options: dict[str, Any] = {field: value for field, value in losses.items() if value is not None}
     return replace(
         usual,
-        radius=float(p.get("radius_m", 30.0)) or (float("inf") if is_real(str(p["data"])) else 30.0),
+        radius=p.get("radius_m", 30.0) or (float("inf") if is_real(p["data"]) else 30.0),
         rate=p.get("rate_hz") or usual.rate,
-        bytes_per_second=cap or float("inf"),
+        bytes_per_second=p.get("cap_bytes_per_second") or float("inf"),
         schedule=p.get("schedule", usual.schedule),
         **options,
     )
@@ -269,7 +247,7 @@ def facts(p: Params) -> Mapping[str, str]:
         InputError: parameters that no cell can be computed with.
     """
     sensors(p), attacking(p), channel(p), start(p), egos(p)
-    if int(p.get("runs", 1)) < 1:
+    if p.get("runs", 1) < 1:
         raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
     return {"code": revision(*CODE), **_digests(p["data"])}
 
@@ -281,30 +259,26 @@ def _digests(data: str) -> Mapping[str, str]:
     return {"fleet": fleet(data).digest, **measurements}
 
 
-def recording(p: Params) -> Recording:
-    """Recording of the cell's vehicles; the real measurements where there are any."""
-    return _attacked(p, remove_outliers=False)
+def recording(p: Params, remove_outliers: bool = False) -> Recording:
+    """Recording of the cell's vehicles; the real measurements where there are any.
 
-
-def without_outliers(p: Params) -> Recording | None:
-    """The same without outliers and false fixes, as of an estimator which is told of them; None if there are none."""
-    return _attacked(p, remove_outliers=True) if sensors(p).outliers or attacking(p) else None
-
-
-def _attacked(p: Params, remove_outliers: bool) -> Recording:
+    Args:
+        p: parameters of the cell.
+        remove_outliers: leave out outliers and false fixes, as an estimator does which is told of them.
+    """
     from coopoc.methods.catalogue import needs_whole_fleet
 
     who, attack = egos(p), attacking(p)
-    observers = None if needs_whole_fleet(str(p.get("method"))) else who
-    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, remove_outliers)
-    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, remove_outliers=remove_outliers) if attack else drawn
+    observers = None if needs_whole_fleet(p.get("method", "")) else who
+    drawn = _recording(p["data"], sensors(p), channel(p), p["runs"], p["seed"], observers, remove_outliers)
+    return spoofed(drawn, attack, seed=p["seed"], honest=who, remove_outliers=remove_outliers) if attack else drawn
 
 
 def attacking(p: Params) -> Spoofing | None:
     """The attack of the cell, if there is one."""
-    if not (share := float(p.get("spoofed_share", 0.0))):
+    if not (share := p.get("spoofed_share", 0.0)):
         return None
-    return Spoofing(share, start=float(p.get("spoofed_from_s", 0.0)), collude=bool(p.get("spoofed_collude", False)))
+    return Spoofing(share, start=p.get("spoofed_from_s", 0.0), collude=p.get("spoofed_collude", False))
 
 
 def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
@@ -316,7 +290,8 @@ def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
 def _recording(
     data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None, remove_outliers: bool
 ) -> Recording:
-    log = _log(data)
-    if log is not None:
-        return _under(log, v2x, runs, seed)
+    if (log := _log(data)) is not None:
+        from coopoc.data.log.links import under
+
+        return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
     return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers, remove_outliers=remove_outliers)

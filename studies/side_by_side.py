@@ -1,17 +1,13 @@
 """Any methods beside each other, and beside the bound, under conditions of one's own choice."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from coopoc.study.numbers import present, ran, rms
+from coopoc.study.numbers import Results, present, ran, rms
 from coopoc.study.style import look
+from coopoc.study.tables import Table
 
 from . import lineup, scene
-from .views import TableView, of, table
-
-if TYPE_CHECKING:
-    from coopoc import Results
-    from coopoc.study.figures import Plot
-    from coopoc.study.tables import Table
+from .views import Plot, TableView, of, table
 
 METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-filter", "bound")
 CONDITIONS: dict[str, Any] = {
@@ -38,7 +34,7 @@ errors, errors of the heading, the start."""
 HELD = "GNSS repeats a fix until the next one, and errs by the way driven since."
 
 
-def _changed(results: "Results") -> str:
+def _changed(results: Results) -> str:
     kept, idle = results.settings, scene.idle(results)
     changed = [name for name, usual in CONDITIONS.items() if kept[name] != usual]
     acting, others = [f"{n} {kept[n]}" for n in changed if n not in idle], [n for n in changed if n in idle and kept[n]]
@@ -49,12 +45,12 @@ def _changed(results: "Results") -> str:
 def _table(text: str, value: str, **options: Any) -> TableView:
     """Methods that have the metric, and K across."""
 
-    def view(results: "Results") -> "Table | None":
+    def view(results: Results) -> Table | None:
         if value not in results.frame:
             return None
         methods = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
         texts = (text, *([_changed(results)] if _changed(results) else []))
-        real = scene.measured(str(results.settings["data"]))
+        real = scene.measured(results.settings["data"])
         if real is not None and value in ("rt_le_m", "innovation_m"):
             texts += (HELD * ("gnss" in methods), f"The log: {'; '.join(real.notes[1:])}.")
         rows, where = ("method", "noise_model"), {"method": methods}
@@ -63,7 +59,7 @@ def _table(text: str, value: str, **options: Any) -> TableView:
     return view
 
 
-def _figure(results: "Results") -> "Plot | None":
+def _figure(results: Results) -> "Plot | None":
     from coopoc.study import figures
 
     if present(results, {}) is None or results.frame["max_neighbours"].nunique() < 2:
@@ -73,7 +69,7 @@ def _figure(results: "Results") -> "Plot | None":
     return figures.sweep(results, x="max_neighbours", log=True, caption=caption)
 
 
-def _findings(results: "Results") -> dict[str, str]:
+def _findings(results: Results) -> dict[str, str]:
     """The best filter at each K, the largest first; smoothers know later measurements and are no filters."""
     texts, rows = {}, results.frame
     for k in sorted(rows["max_neighbours"].unique(), reverse=True) if len(rows) else ():

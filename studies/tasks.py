@@ -1,9 +1,8 @@
 """CL-Bench: its tasks, fixed by version: simulated drives with what goes wrong, logs of real robots, and graphs."""
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from coopoc import (
     Fault,
     Fleet,
     InputError,
-    Message,
     Outliers,
     PoseFilter,
     Recording,
@@ -32,15 +30,14 @@ from coopoc import (
 )
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring, cache_folder, holder, public
-from coopoc.evaluate.bounds import past_bound
-from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors
-from coopoc.evaluate.statistics import Interval, mean_interval
+from coopoc.evaluate.scores import online_columns
+from coopoc.evaluate.statistics import mean_interval
 from coopoc.study.study import Row
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
-from .pose_drives import GATE, hashed
+from .pose_drives import GATE, POSES, hashed
 
 VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
@@ -135,30 +132,18 @@ def bound(task: Task, information: str) -> float:
     """
     fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
-    wrong = bool(sensors.outliers or task.attack.share)
-    runs = FEW if information in ("past", "fleet") else task.runs
-    clean = (
-        recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)[0] if wrong else None
-    )
+    clean: Recording | None = None
+    if sensors.outliers or task.attack.share:
+        runs = FEW if information in ("past", "fleet") else task.runs
+        clean, _ = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)
     if information == "fleet":
         bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, list(task.columns)], 1, 0)]
     else:
-        of_ego, near = (
-            past_bound if information == "past" else posterior_bound,
-            V2X(0) if information == "solo" else v2x,
-        )
-        bounds = [of_ego(fleet, sensors, ego, near, recording=clean) for ego in task.columns]
+        near, past = V2X(0) if information == "solo" else v2x, information == "past"
+        bounds = [posterior_bound(fleet, sensors, ego, near, past=past, recording=clean) for ego in task.columns]
     return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
 
 
-POSES: Mapping[str, Mapping[str, Any]] = {
-    "pose-solo": {"unit": "solo"},
-    "pose-plain": {"unit": "solo", "exact": False, "robust": False, "lasting": False},
-    "pose-fleet": {"unit": "fleet"},
-    "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
-    "pose-naive": {"unit": "fleet", "fusion": "naive"},
-}
-"""Pose filters by name: their options."""
 RANGE_STD = 0.3
 """m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
 
@@ -227,29 +212,24 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in assumed.items() if name in own})  # type: ignore[type-var]
-    who = [k for k in range(len(recording.ids)) if k not in recording.landmarks]
-    ids = [recording.ids[k] for k in who]
+    ids = [name for k, name in enumerate(recording.ids) if k not in recording.landmarks]
     made(recording.between(0, 3), ids)  # compiles
-    began = time.perf_counter()
     track = made(recording, ids)
-    seconds = time.perf_counter() - began
-    squares = np.square(blocks_of(errors(track, fleet)[0], start, block_s / fleet.dt))
-    level = mean_interval(np.sqrt(squares).T)
-    row: Row = {"task": task, "data": hashed(path)}
-    row |= {"rt_le_m": rounded(level)}
+    blocks = partial(blocks_of, start=start, length=block_s / fleet.dt)
+    row: Row = {"task": task, "data": hashed(path), "rt_le_m": rounded(blocks(errors(track, fleet)[0]).T)}
     if fleet.heading is None:
-        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][:, start:])), 2)}
+        row["nees"] = round(np.nanmean(planar(track, fleet)[1][:, start:]), 2)
     elif track.heading is not None:
-        turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, block_s / fleet.dt))
-        row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
-        row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
-    row["received_bytes_per_second"] = received(track, recording, made.message)
-    row["microseconds_per_step"] = round(1e6 * seconds / len(recording.t) / len(who), 2)
+        row["heading_deg"] = round(float(np.nanmean(np.rad2deg(blocks(heading_error(track, fleet)[0])))), 3)
+        row["nees"] = round(np.nanmean(pose_nees(track, fleet)[0, start:]), 2)
+    row["received_bytes_per_second"] = received(track, recording, made)
+    row["microseconds_per_step"] = round(1e6 * track.seconds / len(recording.t) / len(ids), 2)
     return row
 
 
-def rounded(level: Interval) -> list[float]:
-    """Mean and ends of an interval of metres."""
+def rounded(errors: Floats) -> list[float]:
+    """Mean of errors m, (R, E) or (R,), and the ends of its interval."""
+    level = mean_interval(errors)
     return [round(value, 4) for value in (level.mean, level.low, level.high)]
 
 
@@ -261,10 +241,9 @@ def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
     return gap, np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
 
 
-def received(track: Track, recording: Recording, message: Message) -> int:
+def received(track: Track, recording: Recording, method: Any) -> int:
     """B/s on air that an ego receives."""
-    account = of_track(track, recording, message)
-    return round(float((account.of("online", "on air", "per receiver") / account.seconds).mean()))
+    return round(float(online_columns(track, recording, method)["bytes_per_second"].mean()))
 
 
 def blocks_of(error: Floats, start: int, length: float) -> Floats:

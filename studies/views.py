@@ -4,30 +4,25 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from coopoc.study.numbers import Number, Where, present
-from coopoc.study.style import Panel, look
+from coopoc.study.numbers import Number, Results, Where, present
+from coopoc.study.style import Panel
 from coopoc.study.tables import Entry, Table, crossed, pivot, unused
 
 from . import scene
 
 if TYPE_CHECKING:
-    from coopoc import Results
-    from coopoc.study.plot import Plot
+    from coopoc.study import plot
 
-TableView: TypeAlias = Callable[["Results"], Table | None]
+Plot: TypeAlias = "plot.Plot"
+"""For annotations: its module loads matplotlib, for which a mistake in --set need not wait."""
+TableView: TypeAlias = Callable[[Results], Table | None]
 FigureView: TypeAlias = "Callable[[Results], Plot | None]"
 Rows: TypeAlias = Iterable[tuple[Sequence[Entry], Where]]
-HEAD = ("Method", "Noise model")
 
 
 def of(method: str, noise_model: str, /, **at: Any) -> dict[str, Any]:
     """A method under a noise model, as parameters of a cell or as a selection."""
     return {**at, "method": method, "noise_model": noise_model}
-
-
-def labelled(pairs: Iterable[tuple[str, str]], **at: Any) -> Rows:
-    """Rows of a table under HEAD: labels and selection of each method under its noise model."""
-    return [((look(method).label, model), of(method, model, **at)) for method, model in pairs]
 
 
 def table(
@@ -55,7 +50,7 @@ def table(
             return None
         shown = {"decimals": scene.decimals(results.settings), **options}
         made = pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
-        return replace(made, notes=(*made.notes, *unused(results, scene.is_real(str(results.settings["data"])))))
+        return replace(made, notes=(*made.notes, *unused(results, scene.is_real(results.settings["data"]))))
 
     return view
 
@@ -81,8 +76,7 @@ def selections(
 
     def view(results: "Results") -> Table | None:
         shown = rows(results) if callable(rows) else rows
-        where = {**results.settings, **(at or {})}
-        kept = {"decimals": scene.decimals(where), **options}
+        kept = {"decimals": scene.decimals(results.settings), **options}
         return crossed(results, head, shown, columns, scene.caption(results, *texts, **(at or {})), **kept)
 
     return view

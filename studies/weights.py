@@ -35,7 +35,7 @@ WORST = 1.1
 
 def seeds(p: Params) -> range:
     """Training seeds of a study."""
-    return range(int(p["train_seeds"]))
+    return range(p["train_seeds"])
 
 
 def trainable(p: Params) -> bool:
@@ -133,7 +133,8 @@ def checkpoint(name: str, p: Params, seed: int) -> "Checkpoint":
 
 
 @lru_cache
-def _fitted(clients: str, reading: VelocityReading) -> "NoiseModel":
+def fitted(clients: str, reading: VelocityReading) -> "NoiseModel":
+    """Noise fitted on the recording that the nets of training seed 0 saw, or on the measurements of real data."""
     from coopoc import NoiseModel
 
     if is_real(clients):
@@ -144,16 +145,12 @@ def _fitted(clients: str, reading: VelocityReading) -> "NoiseModel":
     return NoiseModel.fitted(observe(moving, acting, V2X(max_neighbours=0), seed=0), moving)
 
 
-def trained(results: "Results") -> list[str]:
-    """The trained methods that a study has run."""
-    ran = results.frame["method"].unique() if "method" in results.frame else ()
-    return sorted((name for name in ran if is_trained(name)), key=lambda name: (*LEARNED, name).index(name))
-
-
 def described(results: "Results") -> Mapping[str, str]:
     """Descriptions of the training of the methods that were run, from the cards of the first seed."""
-    texts = {}
-    for name in trained(results):
+    texts, ran = {}, dict.fromkeys(results.frame.get("method", ()))
+    for name in dict.fromkeys((*LEARNED, *ran)):
+        if name not in ran or not is_trained(name):
+            continue
         card = checkpoint(name, results.settings, 0).card
         plan, how = card["settings"], card["settings"]["schedule"]
         steps = f"{how['epochs']} optimiser steps"
@@ -165,11 +162,6 @@ def described(results: "Results") -> Mapping[str, str]:
             f"key {card['key'][:12]}"
         )
     return texts
-
-
-def fitted(p: Params) -> "NoiseModel":
-    """Noise fitted on the recording that the nets of training seed 0 saw, or on the measurements of real data."""
-    return _fitted(p["clients"], p["velocity_reading"])
 
 
 def train(

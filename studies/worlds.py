@@ -149,9 +149,7 @@ def _town(rng: Draws, t: Floats, split: Split) -> Floats:
     return position
 
 
-@lru_cache
-def _loaded(name: str) -> Fleet:
-    return load_fleet(name)
+_loaded = lru_cache(load_fleet)
 
 
 def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:

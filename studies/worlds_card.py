@@ -4,7 +4,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,8 @@ BAND = special.chdtri(3, [0.975, 0.025])
 EXACT = 1e-9
 """Least ratio that counts in a geometric mean."""
 WORST = 10
+NUMBERS = ("noted", "rt_le_m", "joint_m", "alone_m", "nees_inside", "nees_median", "microseconds_per_step")
+"""Columns of a world, which are NaN but for the first where a method failed."""
 NONE = "nothing wrong"
 
 
@@ -70,7 +72,7 @@ def world_row(name: str, split: Split, params: Params) -> list[Row]:
         raise InputError("estimates", level[name], "must be finite", "Estimate every ego at every step.")
     track = tracks[name]
     row: Row = {"kinds": "; ".join(drawn.kinds), "noted": float(bool(track.notes)), "rt_le_m": level[name]}
-    row |= {"joint_m": level[JOINT], "alone_m": level[ALONE], "nees_inside": np.nan, "nees_median": np.nan}
+    row |= {"joint_m": level[JOINT], "alone_m": level[ALONE]}
     if track.covariance is not None:
         each = nees(track, drawn.fleet, method=name)
         each = each[np.isfinite(each)]
@@ -80,9 +82,7 @@ def world_row(name: str, split: Split, params: Params) -> list[Row]:
     return [row]
 
 
-def run_worlds(
-    methods: Sequence[str], out: Path, count: int, seed: int | None = None, validation: bool = False, jobs: int = 1
-) -> int:
+def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, validation: bool, jobs: int) -> int:
     """Write and print the cards of methods; 1 if a world failed.
 
     Args:
@@ -94,20 +94,18 @@ def run_worlds(
         jobs: processes.
 
     Raises:
-        InputError: no method, an unknown one, less than one world or process.
+        InputError: an unknown method, less than one world or process.
     """
     number("worlds", count, 1, 2**20, kind=int, allowed=">= 1", hint="Cards that are submitted have 1000.")
     number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
     first = number("seed", seed or 0, 0, 2**29, kind=int, allowed="in 0..2^29", hint="Count worlds from 0.")
-    if not methods:
-        raise InputError("methods", "()", "must name a method", "coopoc list shows them.")
     for name in methods:
         named_method(name)
     cards = list[dict[str, Any]]()
     for name in methods:
         began = time.perf_counter()
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
-        file = card_folder(out, seed, validation) / card_file(name)
+        file = card_file(name, out, seed, validation)
         file.write_text(card_text(cards[-1]))
         print(details(cards[-1]), end="\n\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
@@ -115,20 +113,12 @@ def run_worlds(
     return int(any(card["failed"] for card in cards))
 
 
-def card_folder(out: Path, seed: int | None, validation: bool) -> Path:
-    """Folder of cards: apart those of other draws and of validation, which cannot be submitted."""
+def card_file(name: str, out: Path, seed: int | None, validation: bool) -> Path:
+    """File of a method's card; in folders of their own those of other draws and of validation, which cannot be
+    submitted."""
     folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
     folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def card_file(name: str) -> str:
-    """Name of the file of a method's card.
-
-    >>> card_file("mine.py:Own")
-    'mine_py_Own.json'
-    """
-    return f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
+    return folder / f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
 
 
 def card_head(name: str) -> Row:
@@ -150,22 +140,17 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
         jobs: processes.
     """
     cells = [Cell({"seed": k}, {"seed": k}, str(k)) for k in range(seed, seed + count)]
-    rows = list[Row]()
+    rows, failed = list[Row](), dict[int, str]()
     done = progress_bar(compute(partial(world_row, name, split), cells, jobs), name, count, unit="world", delay=2.0)
     for outcome in done:
         at = outcome.cell.settings["seed"]
         if outcome.rows is not None:
             rows += [{"seed": at, **row} for row in outcome.rows.to_pylist()]
             continue
-        reason = outcome.reason.partition("\n")[0][:200]
-        print(f"coopoc: failed: world {at}: {reason}", file=sys.stderr)
-        blank = dict.fromkeys(("rt_le_m", "joint_m", "alone_m", "nees_inside", "nees_median"), np.nan) | {"noted": 1.0}
-        kinds = "; ".join(world(at, split).kinds)
-        rows.append({"seed": at, "kinds": kinds, **blank, "microseconds_per_step": np.nan, "failed": reason})
-    rows.sort(key=lambda row: row["seed"])
-    columns = {key: [_short(row[key]) for row in rows] for key in rows[0] if key != "failed"}
-    failed = {str(row["seed"]): row["failed"] for row in rows if "failed" in row}
-    frame = _frame(columns)
+        failed[at] = outcome.reason.partition("\n")[0][:200]
+        print(f"coopoc: failed: world {at}: {failed[at]}", file=sys.stderr)
+        rows.append({"seed": at, "kinds": "; ".join(world(at, split).kinds), "noted": 1.0})
+    frame = _frame(rows)
     each_kind = frame.assign(kind=frame["kinds"].replace("", NONE).str.split("; ")).explode("kind")
     return {
         **card_head(name),
@@ -173,8 +158,8 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
         "summary": summary(frame),
         "by_kind": {str(kind): summary(part) for kind, part in each_kind.groupby("kind")},
         "worst": _worst(name, split, frame),
-        "failed": failed,
-        "worlds": {key: columns[key] for key in ("seed", "rt_le_m", "joint_m", "alone_m")},
+        "failed": {str(at): failed[at] for at in sorted(failed)},
+        "worlds": {key: [*map(_short, frame[key].tolist())] for key in ("seed", "rt_le_m", "joint_m", "alone_m")},
     }
 
 
@@ -185,14 +170,14 @@ def _short(value: Any) -> Any:
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
-def _frame(columns: Mapping[str, Sequence[Any]]) -> "pd.DataFrame":
-    """Worlds with the ratios to the textbook filter, to being alone and to the better of both; infinite where the
-    method failed."""
+def _frame(rows: Sequence[Row]) -> "pd.DataFrame":
+    """Worlds by seed, to five digits, with the ratios to the textbook filter, to being alone and to the better of both;
+    infinite where the method failed."""
     import pandas as pd
 
-    frame = pd.DataFrame(columns)
-    for key in frame.columns.difference(["seed", "kinds"]):
-        frame[key] = frame[key].astype(float)
+    frame = pd.DataFrame(rows, columns=["seed", "kinds", *NUMBERS]).sort_values("seed", ignore_index=True)
+    for key in NUMBERS:
+        frame[key] = frame[key].map(_short).astype(float)
     better = frame[["joint_m", "alone_m"]].min(axis=1)
     for key, other in (("over_joint", frame["joint_m"]), ("over_alone", frame["alone_m"]), ("over_better", better)):
         frame[key] = (frame["rt_le_m"] / other).fillna(np.inf)
@@ -248,18 +233,15 @@ def card_text(card: Params) -> str:
 
 def overview(cards: Sequence[Params]) -> str:
     """Markdown table of cards, least share of worlds that are worse than the better of both first."""
-    rows = [_shown("method", card["method"], card["summary"]) for card in sorted(cards, key=_order)]
-    return markdown(rows, drop=("over the better", "us/step"))
-
-
-def _order(card: Params) -> tuple[float, float]:
-    return card["summary"]["worse_than_better"][0], card["summary"].get("over_joint", [np.inf])[0]
+    every = [(card["method"], card["summary"]) for card in cards]
+    every.sort(key=lambda card: (card[1]["worse_than_better"][0], card[1].get("over_joint", [np.inf])[0]))
+    return _table("method", every, "over the better")
 
 
 def details(card: Params) -> str:
     """Markdown table of a card by kind of fault, and its worst worlds with the commands that run them."""
     kinds = sorted(card["by_kind"].items(), key=lambda item: -item[1]["worse_than_better"][0])
-    table = markdown([_shown("kind of fault", kind, each) for kind, each in kinds], drop=("95th percentile", "us/step"))
+    table = _table("kind of fault", kinds, "95th percentile")
     lines = [
         f"{_of(row['ratio'])} ({_of(row['rt_le_m'])} m; {JOINT} {_of(row['joint_m'])} m, {ALONE} "
         f"{_of(row['alone_m'])} m): {row['text']}\n    {row['command']}"
@@ -272,20 +254,25 @@ def _of(value: float | None) -> str:
     return "failed" if value is None else three(value)
 
 
-def _shown(head: str, name: str, found: Params) -> Row:
-    return {
-        head: name,
-        "worlds": f"{found['worlds']}" + f" ({found['failed']} failed)" * (found["failed"] > 0),
-        "worse than alone [%]": _level(found["worse_than_alone"]),
-        "worse than the better [%]": _level(found["worse_than_better"]),
-        "without a note [%]": _level(found["worse_unnoted"]),
-        "over joint": _level(found.get("over_joint")),
-        "over the better": _level(found.get("over_better")),
-        "95th percentile": _of(found["percentile_95"]),
-        "NEES inside": _level(found.get("nees_inside")),
-        "median NEES": _of(found["nees_median"]) if "nees_median" in found else "",
-        "us/step": _of(found.get("microseconds_per_step")),
-    }
+def _table(head: str, summaries: Sequence[tuple[str, Params]], left_out: str) -> str:
+    """Markdown table of summaries by name, but for one of its columns."""
+    rows = list[Row]()
+    for name, found in summaries:
+        columns = {
+            head: name,
+            "worlds": f"{found['worlds']}" + f" ({found['failed']} failed)" * (found["failed"] > 0),
+            "worse than alone [%]": _level(found["worse_than_alone"]),
+            "worse than the better [%]": _level(found["worse_than_better"]),
+            "without a note [%]": _level(found["worse_unnoted"]),
+            "over joint": _level(found.get("over_joint")),
+            "over the better": _level(found.get("over_better")),
+            "95th percentile": _of(found["percentile_95"]),
+            "NEES inside": _level(found.get("nees_inside")),
+            "median NEES": _of(found["nees_median"]) if "nees_median" in found else "",
+        }
+        del columns[left_out]
+        rows.append(columns)
+    return markdown(rows)
 
 
 def _level(values: Sequence[float] | None) -> str:
@@ -295,9 +282,8 @@ def _level(values: Sequence[float] | None) -> str:
     return f"{values[0]:.3g}" + f" [{ends}]" * bool(ends)
 
 
-def markdown(rows: Sequence[Row], drop: Sequence[str] = ()) -> str:
-    """Rows as a Markdown table without some of their columns."""
+def markdown(rows: Sequence[Row]) -> str:
+    """Rows as a Markdown table."""
     from tabulate import tabulate
 
-    kept = [{key: value for key, value in row.items() if key not in drop} for row in rows]
-    return tabulate(kept, headers="keys", tablefmt="github", disable_numparse=True)
+    return tabulate(rows, headers="keys", tablefmt="github", disable_numparse=True)

@@ -247,8 +247,8 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
     measured("MRCLAM_Dataset6")
     rows = {}
     for name in ("pose-solo", "pose-fleet", f"{tmp_path / 'mine.py'}:Own"):
-        made = benchmark.card(name, [], tmp_path / "alone") if "fleet" in name else None
-        rows[name] = {row["task"]: row for row in (made or benchmark.card(name, [], measured()))["tasks"]}
+        folder = tmp_path / "alone" if "fleet" in name else measured()
+        rows[name] = {row["task"]: row for row in benchmark.card(name, {}, folder)["tasks"]}
     assert "must hold MRCLAM_Dataset6" in rows["pose-fleet"]["robots"]["failed"]
     solo, whole = rows["pose-solo"]["uwb"], rows["pose-fleet"]["uwb"]
     assert whole["rt_le_m"][2] < solo["rt_le_m"][0]

@@ -251,6 +251,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     assert re.match("K = 1 without a landmark.* with 1 landmark ", real.STUDY.answers(results)["worth, K = 1"])
     two = replace(results, frame=results.select(method="pose-fleet", landmarks=1, max_neighbours=[0, 1]))
     assert "over 2 cells" in real.STUDY.answers(two)["nees"]
+    assert not real.STUDY.answers(replace(results, frame=results.select(method="pose-naive")))
     monkeypatch.setattr(real.drives, "has_true_poses", lambda _: False)
     assert "No row is trained" in real._caption(results, "")
 

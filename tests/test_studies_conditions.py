@@ -12,7 +12,6 @@ from conftest import formation_fleet, refused
 
 import coopoc as co
 from coopoc import Sensors, run_study
-from coopoc.evaluate.bounds import past_bound, posterior_bound
 from coopoc.studies import conditions as study
 from coopoc.studies import scene
 from coopoc.study import numbers
@@ -139,13 +138,14 @@ def test_shares_keep_the_variance_of_a_fix():
 def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes():
     fleet, noise = formation_fleet(5, 40), co.Sensors.paper_scenario2()
     for k in (0, 4):
-        np.testing.assert_allclose(
-            past_bound(fleet, noise, 0, co.V2X(k)), posterior_bound(fleet, noise, 0, co.V2X(k)), rtol=1e-9
-        )
+        past, star = (co.posterior_bound(fleet, noise, 0, co.V2X(k), past=past) for past in (True, False))
+        np.testing.assert_allclose(past, star, rtol=1e-9)
 
 
 def test_bound_with_the_past_is_lower_where_they_do(crossing):
     noise, v2x = co.Sensors.paper_scenario2(), co.V2X(3)
-    past, star = (np.trace(b(crossing, noise, 1, v2x), axis1=1, axis2=2) for b in (past_bound, posterior_bound))
+    past, star = (
+        np.trace(co.posterior_bound(crossing, noise, 1, v2x, past=past), axis1=1, axis2=2) for past in (True, False)
+    )
     assert (past <= star * (1 + 1e-9)).all()
     assert past[-1] < 0.98 * star[-1]

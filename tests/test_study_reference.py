@@ -10,7 +10,7 @@ import pytest
 from conftest import refused
 
 from coopoc.plugins import find, names
-from coopoc.study.reference import Reference, check, differing, measure, table
+from coopoc.study.reference import Reference, check, measure, table
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
@@ -115,7 +115,6 @@ def test_other_runs_are_allowed_their_standard_errors(results, tmp_path):
 def test_numbers_of_other_settings_are_refused(results, tmp_path):
     known = measure(results, METRICS)
     other = run_study(STUDY, tmp_path / "other", settings={"scale": 2.0, "weights": "there"}, progress=False)
-    assert differing(other, known) == ["scale"]
     with refused(r"is not the reference's in scale\. Run it with its own settings"):
         check(other, known)
 

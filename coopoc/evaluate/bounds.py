@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..arrays import Bools, Floats, Ints, checked, instance, refuse
 from ..errors import InputError
@@ -38,6 +39,7 @@ def posterior_bound(
     v2x: V2X | None = None,
     *,
     smoothing: bool = False,
+    past: bool = False,
     recording: Recording | None = None,
 ) -> Floats:
     r"""Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
@@ -58,6 +60,9 @@ def posterior_bound(
         ego: column or id.
         v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
+        past: of an ego that knows the fixes and velocities of vehicles before they come into its star, too, as messages
+            bring it that carry sums since departure. It is never above the star's bound, and equal to it while the same
+            neighbours stay.
         recording: of this drive, such as `observe(..., remove_outliers=True)`: a fix, a range or an angle that it lacks
             (NaN) is not measured, and the bound is the mean over its runs. Default: all is measured.
 
@@ -72,34 +77,14 @@ def posterior_bound(
     v2x, column = checked_noise(fleet, sensors, v2x), fleet.index(ego)
     if not fleet.present[:, column].all():
         raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
-    instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     links = find_links(fleet, [column], v2x, sensors.min_range)
-    steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
-    members = [np.append(column, near) for near in steps]
+    if instance("past", past, bool, "Give True for what messages bring of newcomers."):
+        ever = np.isin(np.arange(len(fleet.ids)), [column, *links.neighbour])  # the others say nothing about it
+        members = [np.flatnonzero(row & ever) for row in fleet.present]
+    else:
+        steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
+        members = [np.append(column, near) for near in steps]
     return _bound(fleet, sensors, links, members, smoothing, recording)[:, column]
-
-
-def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X, *, recording: Recording | None = None) -> Floats:
-    """`posterior_bound` (T, 3, 3) m^2, filtering, of an ego that knows all fixes and velocities of all vehicles, too.
-
-    Messages that carry sums since departure bring a new neighbour's past, which a star that forgets absent vehicles
-    does not count. It is never above the star's bound, and equal to it while the same neighbours stay.
-
-    Args:
-        fleet: truth.
-        sensors: the noise that acts, stds positive.
-        ego: column.
-        v2x: K and radius, not loss.
-        recording: as in `posterior_bound`.
-
-    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-    >>> float(past_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0, V2X(0))[1, 0, 0])  # standing still: 4 / 2
-    2.0
-    """
-    links = find_links(fleet, [ego], v2x, sensors.min_range)
-    near = np.isin(np.arange(len(fleet.ids)), [ego, *np.unique(links.neighbour)])  # the others say nothing about it
-    members = [np.flatnonzero(row & near) for row in fleet.present]
-    return _bound(fleet, sensors, links, members, False, recording)[:, ego]
 
 
 def fleet_bound(
@@ -120,7 +105,6 @@ def fleet_bound(
     2.0
     """
     v2x = checked_noise(fleet, sensors, v2x)
-    instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     links = find_links(fleet, range(len(fleet.ids)), v2x, sensors.min_range)
     return _bound(fleet, sensors, links, [np.flatnonzero(row) for row in fleet.present], smoothing, recording)
 
@@ -155,7 +139,7 @@ def pose_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landma
     links = find_links(fleet, range(len(fleet.ids)), v2x, sensors.min_range, marks)
     members = [np.setdiff1d(np.flatnonzero(row), marks) for row in fleet.present]
     stages = pose_stages(fleet, sensors, links, members)
-    return _marginals(fleet, stages, covariances(stages, smoothing=False))
+    return _marginals(fleet, stages, smoothing=False)
 
 
 def bound_rt_le(cov: Floats) -> float:
@@ -197,13 +181,13 @@ def _bound(
     fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool, recording: Recording | None
 ) -> Floats:
     """Bound covariances (T, N, 3, 3) m^2 of positions, NaN for those that are no members; the mean over runs."""
-    if smoothing:
+    if instance("smoothing", smoothing, bool, "Give True for the bound of a smoother."):
         require_white(sensors, "the smoothing bound")
     runs = [None] if recording is None else _measured(fleet, links, np.unique(np.concatenate(members)), recording)
     total: Floats = np.zeros(())
     for run in runs:
         stages = position_stages(fleet, sensors, links, members, run)
-        total = total + _marginals(fleet, stages, covariances(stages, smoothing))[..., :3, :3]
+        total = total + _marginals(fleet, stages, smoothing)[..., :3, :3]
     return total / len(runs)
 
 
@@ -215,10 +199,12 @@ def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -
     """
     instance("recording", recording, Recording, "Give observe(..., remove_outliers=True).")
     fleet.require(recording.ids, recording.t)
-    sides = ("step", "observer", "neighbour")
-    measured, wanted = (np.column_stack([getattr(of, side) for side in sides]) for of in (recording.links, links))
-    row_of = {link: k for k, link in enumerate(map(tuple, measured.tolist()))}
-    rows = [row_of.get(tuple(link), -1) for link in wanted.tolist()]
+    recorded, wanted = (
+        list(zip(of.step.tolist(), of.observer.tolist(), of.neighbour.tolist(), strict=True))
+        for of in (recording.links, links)
+    )
+    row_of = {link: k for k, link in enumerate(recorded)}
+    rows = [row_of.get(link, -1) for link in wanted]
     if -1 in rows:
         hint = "Observe the fleet with the same K and radius, and name the ego among the observers."
         raise InputError("recording", repr(recording), "must hold the links of the bound", hint)
@@ -227,11 +213,11 @@ def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -
     return [Measured(fixes[r], relative[r]) for r in range(1 if alike else recording.runs)]
 
 
-def _marginals(fleet: Fleet, stages: "list[Stage]", found: Iterator[tuple[int, Floats]]) -> Floats:
+def _marginals(fleet: Fleet, stages: "list[Stage]", smoothing: bool) -> Floats:
     """(T, N, d, d) of each member from the covariances of all at each step."""
     d, vehicles = stages[0].motion.shape[-1], len(fleet.ids)
     out = np.full((*fleet.position.shape[:2], d, d), np.nan)
-    for t, cov in found:
+    for t, cov in covariances(stages, smoothing):
         n, members = len(stages[t].members), stages[t].members
         blocks = cov.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
         out[t, members[members < vehicles]] = blocks[members < vehicles]
@@ -260,7 +246,7 @@ class Stage:
 
 
 def position_stages(
-    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], measured: Measured | None = None
+    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], measured: Measured | None
 ) -> list[Stage]:
     """Every step of the positions of vehicles (columns) that are members of it.
 
@@ -278,17 +264,15 @@ def position_stages(
         t, n, m = len(stages), len(now), len(now) - len(behind)
         motion, process, prior = np.ones((n, d)), np.zeros((n, d)), np.zeros((n, d))
         process[:m, :3] = (fleet.dt * sensors.velocity_std(fleet.velocity[t, now[:m]])) ** 2
-        rows = np.zeros((m, 3, n, d))
-        rows[np.arange(m), :, np.arange(m), :3] = np.eye(3)
+        rows, weight = np.kron(np.eye(m, n), np.eye(3, d) + np.eye(3, d, 3)), np.tile(white, m)
         if drifts:
             motion[:m, 3:], process[:m, 3:], prior[:m] = keep, own * (1 - keep**2), [1 / FORGOTTEN] * 3 + [1 / own] * 3
             motion[m, :3], process[m, :3], prior[m] = keep, common * (1 - keep**2), [1 / common] * 3 + [1.0] * 3
-            rows[np.arange(m), :, np.arange(m), 3:] = rows[:, :, m, :3] = np.eye(3)
-        fixes, weight = rows.reshape(3 * m, n * d), np.tile(white, m)
+            rows[:, m * d : m * d + 3] = np.tile(np.eye(3), (m, 1))
         if measured:
             weight *= np.repeat(measured.fixes[t, now[:m]], 3)
             prior[:m, :3] = np.maximum(prior[:m, :3], 1 / FORGOTTEN)
-        gained = edge_information(edges, (n, d), sensors.relative_std) + (fixes.T * weight) @ fixes
+        gained = edge_information(edges, (n, d), sensors.relative_std) + (rows.T * weight) @ rows
         unit = np.eye(d)
         stages.append(Stage(now, previous, motion[..., None] * unit, process[..., None] * unit, prior, gained))
     return stages
@@ -311,15 +295,14 @@ def pose_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints
     stages = list[Stage]()
     for now, previous, edges in steps_of(fleet, links, members):
         t, n = len(stages), len(now)
-        gained = edge_information(edges, (n, d), sensors.relative_std, posed=True) + diagonal(np.tile(own, (n, 1, 1)))
+        gained = edge_information(edges, (n, d), sensors.relative_std, posed=True) + np.kron(np.eye(n), own)
         stages.append(Stage(now, previous, motion[t, now], process[t, now], np.tile(prior, (n, 1)), gained))
     return stages
 
 
 def _own(sensors: Sensors, lasting: list[int]) -> Floats:
     """Information (d, d) of a fix and a compass, which measures its bias with the heading."""
-    rows = np.zeros((4, 4 + len(lasting)))
-    rows[:4, :4] = np.eye(4)
+    rows = np.eye(4, 4 + len(lasting))
     if 2 in lasting:
         rows[3, 4 + lasting.index(2)] = 1.0
     weight = np.append(1.0 / np.square(sensors.fix_std), sensors.heading_std**-2.0 if sensors.compass else 0.0)
@@ -337,8 +320,7 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
     motion[...] = np.eye(d)
     motion[..., :3, 3] = aside
     std = sensors.velocity_std(forward)
-    for axis, unit in enumerate(np.eye(3)):
-        noise[..., :3, axis] = dt * turned(std[..., axis, None] * unit, heading)
+    noise[..., :3, :3] = dt * turned(std[..., None] * np.eye(3), heading[..., None]).swapaxes(-1, -2)
     noise[..., :3, 3], noise[..., 3, 3] = 0.5 * dt * sensors.yaw_rate_std * aside, dt * sensors.yaw_rate_std
     keep = float(np.exp(-dt / sensors.odometry_error_time))
     for column, kind in enumerate(lasting, 4):
@@ -359,13 +341,13 @@ class Edges(NamedTuple):
         vector: (E, 3) m, true.
         observer: (E,) place among the members.
         neighbour: (E,) place, -1 if it is no member.
-        measured: (E, 3) whether range, azimuth and inclination are measured; None: all are.
+        measured: (E, 3) whether range, azimuth and inclination are measured; True: all are.
     """
 
     vector: Floats
     observer: Ints
     neighbour: Ints
-    measured: Bools | None
+    measured: Bools | bool
 
 
 def steps_of(
@@ -378,7 +360,7 @@ def steps_of(
         index[now] = np.arange(len(now))
         observer, neighbour = (side[start[t] : start[t + 1]] for side in (links.observer, links.neighbour))
         vector = fleet.position[t, neighbour] - fleet.position[t, observer]
-        part = None if measured is None else measured[start[t] : start[t + 1]]
+        part = True if measured is None else measured[start[t] : start[t + 1]]
         yield now, before[now], Edges(vector, index[observer], index[neighbour], part)
         before = index
 
@@ -416,8 +398,7 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     sa, ca, si, ci, none = np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination), 0.0 * away
     rows = [[si * ca, si * sa, ci], [-sa / flat, ca / flat, none], [ci * ca / away, ci * sa / away, -si / away]]
     gradients = np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
-    weight = np.broadcast_to(np.square(std) ** -1.0, edges.vector.shape)
-    weight = weight if edges.measured is None else weight * edges.measured
+    weight = np.square(std) ** -1.0 * edges.measured
     return np.asarray(gradients.swapaxes(1, 2) @ (weight[..., None] * gradients))
 
 
@@ -462,9 +443,9 @@ def _onward(cov: Floats, stage: Stage) -> Floats:
     d = stage.motion.shape[-1]
     stays, out = np.flatnonzero(stage.previous >= 0), np.diag(stage.prior.ravel())
     if len(stays):
-        here, there = _numbers(stays, d), _numbers(stage.previous[stays], d)
-        motion = diagonal(stage.motion[stays])
-        moved = motion @ cov[np.ix_(there, there)] @ motion.T + diagonal(stage.process[stays])
+        here, there = (np.add.outer(d * of, np.arange(d)).ravel() for of in (stays, stage.previous[stays]))
+        motion = block_diag(*stage.motion[stays])
+        moved = motion @ cov[np.ix_(there, there)] @ motion.T + block_diag(*stage.process[stays])
         out[np.ix_(here, here)] = np.linalg.inv(moved)
     return out
 
@@ -479,16 +460,3 @@ def _backward(future: Floats, stage: Stage, n: int) -> Floats:
     process[stage.previous[stays]] = (back @ stage.process @ back.swapaxes(1, 2))[stays]
     reverse = replace(stage, previous=previous, motion=motion, process=process, prior=np.zeros((n, d)))
     return _onward(np.linalg.inv(future + stage.gained), reverse)
-
-
-def diagonal(blocks: Floats) -> Floats:
-    """The matrix (nd, nd) that has n blocks (n, d, d) on its diagonal."""
-    n, d = blocks.shape[:2]
-    matrix = np.zeros((n, d, n, d))
-    matrix[np.arange(n), :, np.arange(n)] = blocks
-    return matrix.reshape(n * d, n * d)
-
-
-def _numbers(places: Ints, d: int) -> Ints:
-    """Places of all numbers of members."""
-    return (d * places[:, None] + np.arange(d)).ravel()

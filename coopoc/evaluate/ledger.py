@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, number, one_of, refuse, texts
+from ..arrays import Floats, check_arrays, checked, number, one_of, refuse, texts
 from ..errors import InputError
 from ..methods.track import Track, of_recording
 from ..text import short_repr
@@ -51,17 +51,14 @@ class Ledger:
     def __post_init__(self) -> None:
         for name in ("names", "servers"):
             self.__dict__[name] = texts(name, getattr(self, name))
+        moved = "(2, 2, R, V)", (2, 2, -1, len(self.names))
+        check_arrays(self, {"seconds": ("(V,)", (len(self.names),)), "sent": moved, "received": moved})
         for name in ("seconds", "sent", "received"):
-            values = checked(name, getattr(self, name))
-            refuse(
-                name, values, ~(values >= 0) | np.isinf(values), "must be finite and >= 0", "Give bytes and seconds."
-            )
-            self.__dict__[name] = values
-        shape = (2, 2, *self.sent.shape[2:3], len(self.names))
-        for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):
-            actual = getattr(self, name).shape
-            if actual != wanted:
-                raise InputError(name, actual, f"must have shape {wanted}", "See the Args of Ledger.")
+            values = getattr(self, name)
+            wrong = ~(values >= 0) | np.isinf(values)
+            refuse(name, values, wrong, "must be finite and >= 0", "Give bytes and seconds.")
+        if self.received.shape != self.sent.shape:
+            raise InputError("received", self.received.shape, f"must have shape {self.sent.shape}", "Give all runs.")
         if len(set(self.names)) < len(self.names) or not set(self.servers) <= set(self.names):
             raise InputError("names", self.names, f"must differ and hold the servers {self.servers}", "Rename them.")
 

@@ -1,11 +1,9 @@
 """Errors of a Track against its Fleet: RT-LE, maximum, heading, NEES; metrics by name; innovations without a truth."""
 
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 
 import numpy as np
 from scipy import special
-from scipy.spatial.transform import Rotation
 
 from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
@@ -68,10 +66,10 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     if track.neighbours is None:
         return np.full((len(track.x), len(track.egos)), np.nan)
     own_links = [recording.links.of(ego) for ego in track.egos]
-    links, ends = np.concatenate(own_links), np.cumsum([0, *map(len, own_links)])
+    links, ends = np.concatenate(own_links), np.cumsum([*map(len, own_links)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
     square = np.square(track.neighbours - truth).sum(axis=-1)
-    parts = [square[:, first:last] for first, last in pairwise(ends)]
+    parts = np.split(square, ends[:-1], axis=1)
     with np.errstate(invalid="ignore"):
         mean = [np.nansum(part, axis=1) / np.isfinite(part).sum(axis=1) for part in parts]
     return np.asarray(np.sqrt(np.stack(mean, axis=1)))
@@ -324,11 +322,9 @@ def aligned(estimate: Floats, truth: Floats) -> Floats:
     [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]
     """
     x, y = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
-    if x.shape[1] == 2:
-        turn = np.vdot(x @ [1, 1j], y @ [1, 1j])
-        turned = (x @ [1, 1j]) * turn / np.abs(turn)
-        return np.asarray(np.stack([turned.real, turned.imag], axis=-1) + truth.mean(axis=0))
-    return np.asarray(Rotation.align_vectors(y, x)[0].apply(x) + truth.mean(axis=0))
+    u, _, vh = np.linalg.svd(x.T @ y)
+    u[:, -1] *= np.sign(np.linalg.det(u @ vh))  # a turn, and no reflection
+    return np.asarray(x @ u @ vh + truth.mean(axis=0))
 
 
 def alignment_error(estimate: Floats, truth: Floats) -> float:

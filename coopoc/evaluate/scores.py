@@ -77,11 +77,10 @@ def scored(
                 "Take egos in this order.",
             )
         seconds += track.seconds
-        rates = online_columns(track, part, method)
+        parts.append(_errors(track, drive, part, quantiles) if known else innovation_columns(track, part))
+        parts[-1] |= online_columns(track, part, method)
         if not known:
-            parts.append({**innovation_columns(track, part), **rates})
             continue
-        parts.append({**_columns(track, part, drive, quantiles), **rates})
         if metric:
             parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
@@ -112,7 +111,7 @@ def online_columns(track: Track, recording: Recording, method: Method) -> dict[s
     return {**rates, "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float)}
 
 
-def _columns(track: Track, recording: Recording, drive: Fleet, quantiles: int) -> dict[str, AnyArray]:
+def _errors(track: Track, drive: Fleet, recording: Recording, quantiles: int) -> dict[str, AnyArray]:
     """Columns of errors that need no average over runs."""
     columns = {
         "rt_le_m": rt_le(track, drive),

@@ -50,7 +50,16 @@ def mean_interval(values: AnyArray) -> Interval:
     Interval(mean=1.0, low=1.0, high=1.0, n=15)
     """
     values = _checked("values", values)
-    return _interval(_resampled(values), float(values.mean()), values)
+    mean, n = float(values.mean()), len(values) if len(values) > 1 else values.shape[1]
+    if n < 2:
+        return Interval(mean, math.nan, math.nan, values.size)
+    from scipy import special  # a fifth of a second, which a mistake on the command line need not wait for
+
+    counts, step = _counts(*values.shape, RESAMPLES), max(1, _CHUNK // values.size)
+    sums = [counts[k : k + step].astype(float) @ values.ravel() for k in range(0, RESAMPLES, step)]
+    share = special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, 0.025))
+    low, high = np.quantile(np.concatenate(sums) / values.size, [share, 1 - share])
+    return Interval(mean, float(low), float(high), values.size)
 
 
 def paired_difference(a: AnyArray, b: AnyArray) -> Interval:
@@ -84,27 +93,21 @@ def over_seeds(values: AnyArray) -> Interval:
     >>> print(over_seeds(np.array([1.0, 1.2, 1.1])))
     1.1 [0.852, 1.35]
     """
-    from scipy import special  # a fifth of a second, which a mistake on the command line need not wait for
+    from scipy import special
 
     values = checked("values", values)
     if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
     means: Floats = values.reshape(len(values), -1).mean(axis=1)
+    mean = float(means.mean())
     half = float(special.stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / np.sqrt(len(means)))
-    return Interval(float(means.mean()), float(means.mean()) - half, float(means.mean()) + half, len(means))
-
-
-def _resampled(values: Floats) -> Floats:
-    """(RESAMPLES,) means; the same draws for any values of one shape, so pairs stay pairs."""
-    flat, step = values.ravel(), max(1, _CHUNK // values.size)
-    counts = _counts(*values.shape, RESAMPLES)
-    sums = [counts[k : k + step].astype(float) @ flat for k in range(0, RESAMPLES, step)]
-    return np.concatenate(sums) / values.size
+    return Interval(mean, mean - half, mean + half, len(means))
 
 
 @lru_cache(maxsize=2)
 def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
-    """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each."""
+    """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each; the same draws for any
+    values of one shape, so pairs stay pairs."""
     size, rng = egos * runs, np.random.default_rng(0)
     counts = np.empty((resamples, size), dtype=np.uint16 if size < 2**16 else np.uint32)
     step = max(1, _CHUNK // size)
@@ -115,17 +118,6 @@ def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
         index = (np.arange(count)[:, None, None] * egos + ego) * runs + run
         counts[start : start + count] = np.bincount(index.ravel(), minlength=count * size).reshape(count, size)
     return counts
-
-
-def _interval(resampled: Floats, mean: float, values: Floats) -> Interval:
-    from scipy import special
-
-    n = values.shape[0] if values.shape[0] > 1 else values.shape[1]
-    if n < 2:
-        return Interval(mean, math.nan, math.nan, values.size)
-    low = special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, 0.025))
-    ends = np.quantile(resampled, [low, 1 - low])
-    return Interval(mean, float(ends[0]), float(ends[1]), values.size)
 
 
 def _checked(name: str, values: AnyArray) -> Floats:

@@ -70,6 +70,17 @@ def assignments(texts: Sequence[str]) -> Mapping[str, str]:
     return pairs
 
 
+def entries(value: Any) -> Sequence[Any]:
+    """Entries of a list; a text is split at commas, anything else is one.
+
+    >>> entries("0,3"), entries(4)
+    (['0', '3'], [4])
+    """
+    if isinstance(value, str):
+        return value.split(",")
+    return value if isinstance(value, list | tuple) else [value]
+
+
 def parse(name: str, value: Any, default: Any) -> Any:
     """`value` as the type of `default`: text is read, numbers are checked; a tuple is split at commas, and a list of
     words for one word is joined by "+".
@@ -81,8 +92,7 @@ def parse(name: str, value: Any, default: Any) -> Any:
     (100, (0, 3), 'town10')
     """
     if isinstance(default, list | tuple):
-        items = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
-        return tuple(parse(name, v, default[0] if default else None) for v in items if v != "")
+        return tuple(parse(name, v, default[0] if default else None) for v in entries(value) if v != "")
     if value is None or default is None:
         return None if value is None or str(value).lower() == "none" else _guess(value)
     kind = type(default)

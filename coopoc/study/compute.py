@@ -6,7 +6,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import pyarrow as pa
@@ -19,6 +18,7 @@ from ..errors import InputError
 from ..workers import leave_with
 from . import store
 from .cell import Cell, Params, Row
+from .store import Outcome
 
 Function: TypeAlias = Callable[[Params], list[Row]]
 OF_WORKERS = {
@@ -31,17 +31,6 @@ OF_WORKERS = {
 
 class WorkerDiedError(ChildProcessError):
     """A worker process was killed from outside; finished cells are kept and the next run resumes."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Rows of a cell, or the reason why there are none."""
-
-    cell: Cell
-    rows: pa.Table | None
-    reason: str
-    trace: str
-    seconds: float
 
 
 def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Cell]:
@@ -62,14 +51,13 @@ def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Ce
 
 def attempt(function: Function, cell: Cell) -> Outcome:
     """Compute one cell on one thread; an exception becomes its reason."""
-    start = time.perf_counter()
+    start, rows, reason, trace = time.perf_counter(), None, "", ""
     try:
         with threadpool_limits(limits=1):
             rows = _checked(function(cell.settings), cell)
     except (Exception, SystemExit) as error:
-        reason = f"{type(error).__name__}: {error}"
-        return Outcome(cell, None, reason, traceback.format_exc(), time.perf_counter() - start)
-    return Outcome(cell, rows, "", "", time.perf_counter() - start)
+        reason, trace = f"{type(error).__name__}: {error}", traceback.format_exc()
+    return Outcome(cell, rows, reason, trace, time.perf_counter() - start)
 
 
 def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:

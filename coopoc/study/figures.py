@@ -1,7 +1,7 @@
 """Figures of a study: a metric over an axis, and its bytes."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,17 +10,14 @@ from matplotlib.patheffects import withStroke
 from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..text import picture
-from .numbers import Number, Where, interval, mean, ran
+from .numbers import Number, Results, Where, interval, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
 from .style import Panel, look, words
-
-if TYPE_CHECKING:
-    from .results import Results
 
 __all__ = ["Plot", "curves", "pareto", "sweep"]
 
 
-def sweep(results: "Results", x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
+def sweep(results: Results, x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
     """Plot RT-LE against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
 
     Without a column `method` there is one line per combination of the other axes.
@@ -46,7 +43,7 @@ def sweep(results: "Results", x: str, where: Where | None = None, caption: str =
     return plot
 
 
-def pareto(results: "Results", caption: str, x: str = "bytes_per_second", where: Where | None = None) -> Plot:
+def pareto(results: Results, caption: str, x: str = "bytes_per_second", where: Where | None = None) -> Plot:
     """Plot RT-LE against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
 
     Methods that receive nothing are horizontal lines.
@@ -71,7 +68,7 @@ def pareto(results: "Results", caption: str, x: str = "bytes_per_second", where:
         alone = not marks or of["method"] == "bound"
         shown.append((of, min(y for _, y in points) if alone else marks))
     drawn = {id(of): points for of, points in shown}
-    groups = _coinciding([("", shown)], True, WIDTH * _height([("", shown)], True))
+    groups, _ = _coinciding([("", shown)], log=True)
     groups.sort(key=lambda alike: not isinstance(drawn[id(alike[0])], Mapping))
     with canvas(width=7.0) as (figure, panel):
         for line, *_ in groups:
@@ -100,7 +97,7 @@ STYLE = ("label", "color", "marker", "linestyle", "linewidth")
 
 
 def curves(
-    results: "Results",
+    results: Results,
     panels: Sequence[Panel],
     lines: Sequence[Where],
     caption: str,
@@ -141,8 +138,8 @@ def curves(
             shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
     if not any(drawn for _, drawn in shown):
         return None
-    height_of = _height(shown, log)
-    groups = {id(group[0]): group for group in _coinciding(shown, log, WIDTH * height_of)}
+    coinciding, near = _coinciding(shown, log)
+    groups = {id(group[0]): group for group in coinciding}
     size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": 3.1}
     with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
         named, also = list[dict[str, Any]](), dict[str, str]()
@@ -164,7 +161,7 @@ def curves(
                 if more not in also.setdefault(name_of(names), ""):
                     also[name_of(names)] += more
             alone = [(of, points) for of, points in drawn if id(of) in groups and isinstance(points, Mapping)]
-            _name_alike(axis, alone, log, WIDTH * height_of)
+            _name_alike(axis, alone, log, near)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if logx:
                 plain_log(axis.xaxis)
@@ -197,7 +194,7 @@ def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near:
     >>> axes.texts[0].xy
     (7, 2.0)
     """
-    for group in _coinciding([("", drawn)], log, near):
+    for group in _coinciding([("", drawn)], log, near)[0]:
         if len(group) > 1:
             x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
             halo = [withStroke(linewidth=2, foreground="white")]
@@ -210,14 +207,18 @@ WIDTH = 0.009
 panel they are named together."""
 
 
-def _coinciding(shown: Sequence[Any], log: bool, near: float) -> list[list[Where]]:
-    """Lines, each with those that lie near it at every point of every panel; a bound stands alone."""
+def _coinciding(shown: Sequence[Any], log: bool, near: float | None = None) -> tuple[list[list[Where]], float]:
+    """Lines, each with those that lie near it at every point of every panel, and what is near: by default a line's
+    width of what all span, from zero or in the logarithm. A bound stands alone."""
     lines: dict[int, tuple[Where, dict[Any, float]]] = {}
     for panel, (_, drawn) in enumerate(shown):
         for of, points in drawn:
             values = points if isinstance(points, Mapping) else {"": points}
             heights = {(panel, x): np.log(_mean(v)) if log else _mean(v) for x, v in values.items()}
             lines.setdefault(id(of), (of, {}))[1].update(heights)
+    if near is None:
+        every = [y for _, heights in lines.values() for y in heights.values()]
+        near = WIDTH * (max(every) - (min(every) if log else 0.0))
     groups: list[list[Where]] = []
     for of, heights in lines.values():
         for group in groups:
@@ -228,14 +229,7 @@ def _coinciding(shown: Sequence[Any], log: bool, near: float) -> list[list[Where
                 break
         else:
             groups.append([of])
-    return groups
-
-
-def _height(shown: Sequence[Any], log: bool) -> float:
-    """What the lines of all panels span, from zero or in the logarithm."""
-    points = [points if isinstance(points, Mapping) else {"": points} for _, drawn in shown for _, points in drawn]
-    values = [_mean(value) for each in points for value in each.values()]
-    return float(np.log(max(values) / min(values))) if log else max(values)
+    return groups, near
 
 
 def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
@@ -253,7 +247,7 @@ def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
     return " = ".join([first, *shown])
 
 
-def _line_names(results: "Results", *across: str) -> list[str]:
+def _line_names(results: Results, *across: str) -> list[str]:
     """Columns that identify a line of a figure: method and noise model, or all axes but those of the figure."""
     usual = [name for name in ("method", "noise_model") if name in results.frame]
     return usual if "method" in usual else [name for name in results.axes if name not in across]

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -38,18 +39,15 @@ class Manifest:
     cells: Mapping[str, Mapping[str, Any]]
     environment: Mapping[str, str]
 
-    def as_stored(self) -> "Manifest":
-        """The manifest as it comes back from its file, where a tuple has become a list."""
-        return Manifest(**json.loads(json.dumps(asdict(self), default=str)))
-
     def save(self, folder: Path) -> None:
         """Write the manifest. If the cells are the same as before, each environment that computed them is named."""
-        used = [self.environment]
+        stored, used = json.loads(json.dumps(asdict(self), default=str)), [self.environment]  # tuples become lists
         with suppress(InputError):
             before = read(folder)
-            used = used if different(self, before) else [before.environment, *used]
-        stored = replace(self, environment=environments(used))
-        store.write(folder / NAME, json.dumps(asdict(stored), indent=1, default=str) + "\n")
+            if asdict(replace(before, environment=self.environment)) == stored:
+                used = [before.environment, *used]
+        stored["environment"] = environments(used)
+        store.write(folder / NAME, json.dumps(stored, indent=1) + "\n")
 
 
 def read(folder: Path) -> Manifest:
@@ -61,31 +59,13 @@ def read(folder: Path) -> Manifest:
     path = folder / NAME
     fields = store.content(path, _FIELDS, f"holds no {NAME}", "Give a folder that coopoc run has made.")
     manifest = Manifest(**{name: fields[name] for name in _FIELDS})
-    texts = [*manifest.axes, *manifest.environment.values()]
-    if not all(isinstance(text, str) for text in texts) or not all(
-        isinstance(p, dict) for p in manifest.cells.values()
-    ):
+    texts, cells = (*manifest.axes, *manifest.environment.values()), manifest.cells.values()
+    if not (all(isinstance(text, str) for text in texts) and all(isinstance(params, dict) for params in cells)):
         raise store.damaged(path, "axes, cells or environment")
     file_name("study", manifest.study, f"Run the study again: {path} was not written by coopoc run.")
     if wrong := next((name for name in manifest.cells if not re.fullmatch("[0-9a-f]{20}", name)), None):
         raise store.damaged(path, f"{wrong[:60]!r} is no name of a cell")
     return manifest
-
-
-def different(first: Manifest, second: Manifest) -> list[str]:
-    """Differences between two manifests, their environments apart.
-
-    >>> first = Manifest("demo", "?", [], {"runs": 4}, {}, {})
-    >>> different(first, replace(first, settings={"runs": 2}))
-    ['runs (4, 2)']
-    """
-    a, b = first.settings, second.settings
-    texts = [f"{name} ({a.get(name)}, {b.get(name)})" for name in {**a, **b} if a.get(name) != b.get(name)]
-    if first.cells != second.cells:
-        same = len(first.cells.keys() & second.cells.keys())
-        texts.append(f"cells ({len(first.cells)} and {len(second.cells)}, {same} of them the same)")
-    pairs = [(field, getattr(first, field), getattr(second, field)) for field in ("study", "question", "axes")]
-    return texts + [f"{field} ({x}, {y})" for field, x, y in pairs if x != y]
 
 
 def environments(used: Sequence[Mapping[str, str]]) -> dict[str, str]:
@@ -94,9 +74,11 @@ def environments(used: Sequence[Mapping[str, str]]) -> dict[str, str]:
     >>> environments([{"python": "3.11"}, {"python": "3.12"}])
     {'python': '3.11; 3.12'}
     """
-    fields = dict.fromkeys(name for each in used for name in each)
-    values = {name: [v for each in used if name in each for v in each[name].split("; ")] for name in fields}
-    return {name: "; ".join(dict.fromkeys(listed)) for name, listed in values.items()}
+    values = defaultdict[str, dict[str, None]](dict)
+    for each in used:
+        for name, listed in each.items():
+            values[name] |= dict.fromkeys(listed.split("; "))
+    return {name: "; ".join(each) for name, each in values.items()}
 
 
 @contextmanager

@@ -9,15 +9,17 @@ from ..arrays import Floats
 from ..evaluate.statistics import Interval, over_seeds, paired_difference
 
 if TYPE_CHECKING:
-    from .results import Results
+    from . import results
 
+Results: TypeAlias = "results.Results"
+"""For annotations: its module loads pandas, for which a mistake in --set need not wait."""
 Where: TypeAlias = Mapping[str, Any]
 """Column -> value, or a list of values."""
-Number: TypeAlias = Callable[["Results", Where], Any]
+Number: TypeAlias = Callable[[Results, Where], Any]
 """An entry of a table for a selection; None where it was not run."""
 
 
-def present(results: "Results", where: Where, value: str = "rt_le_m") -> dict[str, Any] | None:
+def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str, Any] | None:
     """`where` without the values for which nothing was run; None if that leaves no row with a number.
 
     Args:
@@ -25,41 +27,38 @@ def present(results: "Results", where: Where, value: str = "rt_le_m") -> dict[st
         where: the selection.
         value: the metric that is wanted.
     """
-    rows = results.frame
-    if not {*where, value} <= set(rows):
+    if not {*where, value} <= set(results.frame):
         return None
     lists = {name: wanted if isinstance(wanted, list) else [wanted] for name, wanted in where.items()}
-    kept = rows[value].notna().to_numpy()
+    rows = results.frame.dropna(subset=[value])
     for name, wanted in lists.items():
-        kept = kept & rows[name].isin(wanted).to_numpy()
-    if not kept.any():
-        return None
-    return {name: [v for v in wanted if v in set(rows[name][kept])] for name, wanted in lists.items()}
+        rows = rows[rows[name].isin(wanted)]
+    return {name: [v for v in wanted if v in set(rows[name])] for name, wanted in lists.items()} if len(rows) else None
 
 
-def mean(results: "Results", where: Where, value: str = "rt_le_m") -> float | None:
+def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     """Mean of a metric over egos, runs and training seeds."""
     kept = present(results, where, value)
     return None if kept is None else float(results.values(value, kept).mean())
 
 
-def interval(results: "Results", where: Where, value: str = "rt_le_m") -> Interval | None:
+def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval | None:
     """Mean of a metric over egos, runs and training seeds, with its interval over egos, then runs."""
     kept = present(results, where, value)
     return None if kept is None else results.interval(value, kept)
 
 
-def rms(results: "Results", where: Where, value: str = "rt_le_m") -> float | None:
+def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: the quantity that the bound bounds."""
     kept = present(results, where, value)
     if kept is None:
         return None
-    frame = results.select(kept).assign(square=lambda rows: rows[value] ** 2)
-    seeded = "train_seed" in frame and frame["train_seed"].notna().any()
-    return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
+    by = [name for name in ("ego", "train_seed") if name in results.frame]
+    squares = results.select(kept).groupby(by, dropna=False)[value].agg(lambda values: (values**2).mean())
+    return float(np.sqrt(squares).mean())
 
 
-def difference(results: "Results", method: Where, base: Where) -> Interval | None:
+def difference(results: Results, method: Where, base: Where) -> Interval | None:
     """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where either was not run."""
     first, second = present(results, method), present(results, base)
     if first is None or second is None:
@@ -108,32 +107,32 @@ def listed(numbers: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
-def _seeds(results: "Results", where: Where, value: str = "rt_le_m") -> list[Any]:
+def _seeds(results: Results, where: Where, value: str = "rt_le_m") -> list[Any]:
     kept = present(results, where, value)
     frame = results.select(kept) if kept else results.frame.iloc[:0]
     return sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
 
 
-def per_seed(results: "Results", where: Where, value: str = "rt_le_m") -> Floats:
+def per_seed(results: Results, where: Where, value: str = "rt_le_m") -> Floats:
     """(S, R, E) of a metric for each training seed; S = 0 for a method that is not trained."""
     seeds = _seeds(results, where, value)
     return np.array([results.values(value, {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: "Results", where: Where) -> list[float]:
+def seed_means(results: Results, where: Where) -> list[float]:
     """Mean RT-LE for each training seed, m; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
     wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
     return [value for each in wheres if (value := mean(results, each)) is not None]
 
 
-def seed_std(results: "Results", where: Where) -> float | None:
+def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
 
 
-def gaps(results: "Results", first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
+def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
     """What the difference of two selections is over -> its mean and interval: egos and runs, and seeds of the first.
 
     Args:
@@ -149,7 +148,7 @@ def gaps(results: "Results", first: Where, second: Where, value: str = "rt_le_m"
     return intervals
 
 
-def alike(results: "Results", first: Where, second: Where, value: str) -> bool:
+def alike(results: Results, first: Where, second: Where, value: str) -> bool:
     """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or egos or
     runs are others, so that there is none."""
     if results.values(value, first).shape != results.values(value, second).shape:
@@ -158,7 +157,7 @@ def alike(results: "Results", first: Where, second: Where, value: str) -> bool:
     return any(gap.low <= 0 <= gap.high for gap in both.values())
 
 
-def verdict(results: "Results", trained: Where, other: Where, name: str) -> str:
+def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
 
     Args:

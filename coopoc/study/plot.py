@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ..text import picture
 from . import store
 from .style import RC, line, look
 
-FIXED: Mapping[str, Mapping[str, Any]] = {
+FIXED: Mapping[str, dict[str, Any]] = {
     "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
     "svg": {"Date": None, "Creator": None},
     "png": {"Software": None},
@@ -43,9 +44,7 @@ class Plot:
                 x, y, width, height = (round(side, 5) for side in axes.get_position(original=True).bounds)
                 axes.set_position((x, y, width, height))
             for suffix, metadata in FIXED.items():
-                buffer = BytesIO()
-                self.figure.savefig(buffer, format=suffix, metadata=dict(metadata))
-                store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
+                store.write(Path(f"{path}.{suffix}"), partial(self.figure.savefig, format=suffix, metadata=metadata))
         return self.caption
 
     def _repr_png_(self) -> bytes:

@@ -7,6 +7,7 @@ import importlib.util
 import inspect
 import os
 import platform
+import re
 import subprocess
 import sys
 import textwrap
@@ -162,9 +163,7 @@ def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:
 
 
 def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
-    except OSError:
-        model = ""
-    return f"{model or platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+    with suppress(OSError):
+        if model := re.search(r"^model name\s*:(.+)", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return f"{model[1].strip()}, {os.cpu_count()} cores"
+    return f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"

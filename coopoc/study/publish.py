@@ -12,7 +12,7 @@ from ..workers import progress_bar
 from . import store
 from .results import Results
 from .study import Study
-from .tables import FORMATS, Table
+from .tables import Table
 
 VIEWS = "views.json"
 _FIELDS = {
@@ -42,9 +42,9 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
     results.to_parquet(folder / "results.parquet")
     missing, errors = dict[str, str](), list[Exception]()
 
-    def made(name: str, view: Callable[[Results], Any] | None) -> Any:
+    def made(name: str, view: Callable[[Results], Any]) -> Any:
         try:
-            return view(results) if view else None
+            return view(results)
         except Exception as error:
             missing[name] = f"{type(error).__name__}: {error}"
             errors.append(error)
@@ -53,17 +53,12 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
     shown: dict[str, list[dict[str, Any]]] = {"tables": [], "figures": []}
     total = len(study.tables) + len(study.figures)
     with progress_bar(total=total, desc=f"{study.name}: views", unit="view", disable=not progress, leave=False) as bar:
-        for name, view in study.tables.items():
-            if (table := made(name, view)) is not None:
-                for form, suffix in FORMATS.items():
-                    store.write(folder / "tables" / f"{name}.{suffix}", table.render(form))
-                shown["tables"].append({"name": name, "caption": " ".join(table.words), "table": vars(table)})
-            bar.update()
-        for name, figure in study.figures.items():
-            if (plot := made(name, figure)) is not None:
-                caption = plot.save(folder / "figures" / name)
-                shown["figures"].append({"name": name, "caption": caption})
-            bar.update()
+        for kind, listed in shown.items():
+            for name, view in getattr(study, kind).items():
+                if (each := made(name, view)) is not None:
+                    content = {"table": vars(each)} if kind == "tables" else {}
+                    listed.append({"name": name, "caption": each.save(folder / kind / name), **content})
+                bar.update()
     with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers
         before = views(folder)
         for kind, listed in shown.items():
@@ -71,7 +66,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
             for path in (folder / kind).glob("*.*"):
                 if path.stem in old:
                     path.unlink()
-    content = {
+    stored = {
         **shown,
         "findings": dict(made("findings", study.answers) or {}),
         "recipe": dict(made("recipe", study.recipe) or {}),
@@ -79,7 +74,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         "idle": sorted(made("idle", study.idle) or ()),
         "limitations": list(study.limitations),
     }
-    store.write(folder / VIEWS, json.dumps(content, indent=1, default=_data, ensure_ascii=False) + "\n")
+    store.write(folder / VIEWS, json.dumps(stored, indent=1, default=_data, ensure_ascii=False) + "\n")
     if errors and not results.failed:
         raise errors[0]
 

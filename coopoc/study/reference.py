@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,20 +151,13 @@ def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
         tolerance = TRAINED if SEED in rows and rows[SEED].notna().any() else TOLERANCE
         for metric, better in metrics.items():
-            each = ego_by_run(rows, metric)[0] if metric in rows and rows[metric].notna().any() else np.empty((0, 0))
+            each = ego_by_run(rows, metric)[0] if metric in rows else np.empty(0)
             if each.size:
                 runs = each.shape[1]
-                std = float(each.mean(axis=0).std(ddof=1)) if runs > 1 else 0.0
+                std = each.mean(axis=0).std(ddof=1) if runs > 1 else 0.0
                 mean, std = (float(f"{value:.6g}") for value in (each.mean(), std))  # more depends on the machine
                 numbers.append(Number(where, metric, mean, runs, std, tolerance, better))
     return Reference(results.study, {k: plain(v) for k, v in results.settings.items()}, tuple(numbers))
-
-
-def differing(results: Results, reference: Reference) -> list[str]:
-    """Settings that must be equal for a comparison with the reference, and are not."""
-    settings = {name: plain(value) for name, value in results.settings.items()}
-    names = {*settings, *reference.settings} - set(FREE)
-    return sorted(name for name in names if settings.get(name) != reference.settings.get(name))
 
 
 def check(results: Results, reference: Reference) -> list[Change]:
@@ -172,21 +166,19 @@ def check(results: Results, reference: Reference) -> list[Change]:
     Raises:
         InputError: their settings differ, so that the numbers mean different things.
     """
-    if others := differing(results, reference):
-        allowed = f"is not the reference's in {', '.join(others)}"
+    measured = measure(results, {number.metric: number.better for number in reference.numbers})
+    a, b = reference.settings, measured.settings
+    if others := sorted(name for name in {*a, *b} - {*FREE} if a.get(name) != b.get(name)):
+        differs = f"is not the reference's in {', '.join(others)}"
         hint = f"Run it with its own settings; {', '.join(FREE)} may differ."
-        raise InputError("settings", results.study, allowed, hint)
-    before = {number.key: number for number in reference.numbers}
-    now = measure(results, {number.metric: number.better for number in reference.numbers}).numbers
-    return [_change(before[number.key], number) for number in now if number.key in before]
-
-
-def _change(was: Number, now: Number) -> Change:
-    noise = 0.0 if was.runs == now.runs else SIGMA * was.run_std * np.sqrt(1 / was.runs + 1 / now.runs)
-    allowed = float(was.tolerance * abs(was.value) + noise)
-    moved = now.value - was.value
-    interval = Interval(moved, moved - allowed, moved + allowed, now.runs)
-    return Change(was, now.value, interval)
+        raise InputError("settings", results.study, differs, hint)
+    before, changes = {number.key: number for number in reference.numbers}, []
+    for now in measured.numbers:
+        if was := before.get(now.key):
+            noise = 0.0 if was.runs == now.runs else SIGMA * was.run_std * np.sqrt(1 / was.runs + 1 / now.runs)
+            moved, allowed = now.value - was.value, float(was.tolerance * abs(was.value) + noise)
+            changes.append(Change(was, now.value, Interval(moved, moved - allowed, moved + allowed, now.runs)))
+    return changes
 
 
 def table(changes: Sequence[Change], everything: bool = False) -> Table:
@@ -196,7 +188,7 @@ def table(changes: Sequence[Change], everything: bool = False) -> Table:
         changes: of `check`.
         everything: show the numbers that hold, too.
     """
-    counts = {word: sum(change.verdict == word for change in changes) for word in ("within noise", "worse", "better")}
+    counts = Counter(change.verdict for change in changes)
     moved = [f"; {counts[word]} {word}" for word in ("worse", "better") if counts[word]]
     text = f"{counts['within noise']} of {len(changes)} reference numbers hold{''.join(moved)}."
     shown = [change for change in changes if everything or change.verdict != "within noise"]

@@ -70,10 +70,12 @@ class Results:
         done, failed, pending = [], [], 0
         for name in manifest.cells:
             table = store.load(folder, name)
-            failure = None if table is not None else store.load_failure(folder, name)
-            done += [table] if table is not None else []
-            failed += [failure] if failure is not None else []
-            pending += table is None and failure is None
+            if table is not None:
+                done.append(table)
+            elif (failure := store.load(folder, name, store.FAILED)) is not None:
+                failed.append(failure)
+            else:
+                pending += 1
         header = manifest.study, manifest.question, tuple(manifest.axes), manifest.settings
         return cls(*header, _joined(done), _joined(failed), pending, manifest.environment)
 

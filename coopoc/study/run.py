@@ -59,7 +59,7 @@ def run_study(
     number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
     params = {cell.name: dict(cell.params) for cell in cells}
     manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, environment())
-    with locked(folder, manifest.as_stored()):
+    with locked(folder, manifest):
         _work(study, cells, folder, jobs, progress, retry_failed)
         results = Results.load(folder)
         if results.pending:
@@ -128,7 +128,7 @@ def _unfinished(cells: Sequence[Cell], folder: Path) -> tuple[list[Cell], list[t
     new, failed = [], []
     for cell in cells:
         if store.load(folder, cell.name) is None:
-            row = store.load_failure(folder, cell.name)
+            row = store.load(folder, cell.name, store.FAILED)
             if row is None:
                 new.append(cell)
             else:
@@ -160,11 +160,8 @@ def _work(
     ):
         bar.set_postfix_str(f"{failed} failed" if failed else "")
         for outcome in outcomes:
-            if outcome.rows is None:
-                store.save_failure(folder, outcome.cell, outcome.reason, outcome.trace, outcome.seconds)
-                failed += 1
-            else:
-                store.save(folder, outcome.cell, outcome.rows, outcome.seconds)
+            store.save(folder, outcome)
+            failed += outcome.rows is None
             bar.set_postfix_str(f"{failed} failed" if failed else "", refresh=False)
             bar.update()
 
@@ -180,15 +177,18 @@ def _resolve(study: Study | str, out: str | Path, settings: Params | None) -> tu
 
 def _as_path(name: str, value: Any, out: str | Path) -> Any:
     """The value of a setting; of a Recording, a Log, or a pair (Recording, Fleet of its truth) a path in `out/data`."""
-    pair = (value.recording, value.truth) if hasattr(value, "recording") and hasattr(value, "truth") else value
-    if isinstance(pair, Recording):
-        pair = (pair, None)
-    if isinstance(pair, Fleet):
+    if isinstance(value, Fleet):
         hint = "Give the path of its file, or mine.py:NAME of a function that makes it."
-        raise InputError(name, repr(pair), "must be a name or a path, or a Recording", hint)
-    if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[0], Recording)):
-        return value
-    recording, truth = pair
+        raise InputError(name, repr(value), "must be a name or a path, or a Recording", hint)
+    match value:
+        case Recording() as recording:
+            truth = None
+        case (Recording() as recording, truth):
+            pass
+        case object(recording=Recording() as recording, truth=truth):
+            pass
+        case _:
+            return value
     file = Path(out) / "data" / f"{digest(recording)[:12]}{truth.digest[:8] if truth is not None else ''}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)

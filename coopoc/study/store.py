@@ -5,6 +5,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,19 @@ from ..text import replaceable
 from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
+FINISHED, FAILED = "cells", "failed"
+"""Folders of the cells, by their last outcome."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Rows of a cell, or the reason why there are none."""
+
+    cell: Cell
+    rows: pa.Table | None
+    reason: str
+    trace: str
+    seconds: float
 
 
 def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
@@ -93,32 +107,40 @@ def damaged(path: Path, damage: str) -> InputError:
     return InputError("folder", str(path.parent), f"holds a damaged {path.name} ({damage})", hint)
 
 
-def save(folder: Path, cell: Cell, rows: pa.Table, seconds: float) -> None:
-    """Write the rows of a finished cell and remove its earlier failure."""
-    own = {"cell": cell.name, "status": "ok", "reason": "", "cell_seconds": seconds}
+def save(folder: Path, outcome: Outcome) -> None:
+    """Write the rows of a finished cell and remove its earlier failure; of a failed one its reason, in another file."""
+    cell, rows, status = outcome.cell, outcome.rows, "failed" if outcome.rows is None else "ok"
+    own = {"cell": cell.name, "status": status, "reason": outcome.reason, "cell_seconds": outcome.seconds}
+    if rows is None:
+        _save(_file(folder, cell.name, FAILED), to_table([{**cell.params, **own, "traceback": outcome.trace}]))
+        return
     before, after = (
         {name: pa.repeat(pa.scalar(value), rows.num_rows) for name, value in each.items()}
         for each in (cell.params, own)
     )
     table = pa.table({**before, **dict(zip(rows.column_names, rows.columns, strict=True)), **after})
-    _save(_finished(folder, cell.name), table)
-    _failed(folder, cell.name).unlink(missing_ok=True)
+    _save(_file(folder, cell.name), table)
+    _file(folder, cell.name, FAILED).unlink(missing_ok=True)
 
 
-def save_failure(folder: Path, cell: Cell, reason: str, trace: str, seconds: float) -> None:
-    """Write the reason of a failed cell, apart from the finished ones."""
-    own = {"cell": cell.name, "status": "failed", "reason": reason, "cell_seconds": seconds, "traceback": trace}
-    _save(_failed(folder, cell.name), to_table([{**cell.params, **own}]))
-
-
-def load(folder: Path, name: str) -> pa.Table | None:
-    """Rows of a finished cell; None if there are none, or (with a warning) if the file is damaged."""
-    return _read(_finished(folder, name), name)
-
-
-def load_failure(folder: Path, name: str) -> pa.Table | None:
-    """The row of a failed cell, if that was its last outcome; None (with a warning) if the file is damaged."""
-    return _read(_failed(folder, name), name)
+def load(folder: Path, name: str, kind: str = FINISHED) -> pa.Table | None:
+    """Rows of a finished cell, or the row of one whose last outcome FAILED; None if there are none, or (with a warning)
+    if the file is damaged."""
+    path = _file(folder, name, kind)
+    if not path.exists():
+        return None
+    try:
+        content = path.read_bytes()
+        if not holds(content):
+            raise pa.ArrowInvalid("its checksum is wrong")
+        table = pq.read_table(BytesIO(content))
+        if set(OWN_COLUMNS) <= set(table.column_names) and set(table["cell"].to_pylist()) == {name}:
+            return table
+        damage = "it does not hold the rows of this cell"
+    except (pa.ArrowException, OSError) as error:
+        damage = str(error)
+    warnings.warn(f"{path} is damaged and will be computed again: {damage}", RuntimeWarning, stacklevel=2)
+    return None
 
 
 def to_table(rows: Sequence[Row]) -> pa.Table:
@@ -133,30 +155,5 @@ def _save(path: Path, table: pa.Table) -> None:
     write(path, sealed(buffer.getvalue()))
 
 
-def _checked(content: bytes) -> pa.Table:
-    """The table of a file whose checksum is right; pa.ArrowInvalid otherwise."""
-    if not holds(content):
-        raise pa.ArrowInvalid("its checksum is wrong")
-    return pq.read_table(BytesIO(content))
-
-
-def _read(path: Path, name: str) -> pa.Table | None:
-    if not path.exists():
-        return None
-    try:
-        table = _checked(path.read_bytes())
-        if set(OWN_COLUMNS) <= set(table.column_names) and set(table["cell"].to_pylist()) == {name}:
-            return table
-        damage = "it does not hold the rows of this cell"
-    except (pa.ArrowException, OSError) as error:
-        damage = str(error)
-    warnings.warn(f"{path} is damaged and will be computed again: {damage}", RuntimeWarning, stacklevel=3)
-    return None
-
-
-def _finished(folder: Path, name: str) -> Path:
-    return folder / "cells" / f"{name}.parquet"
-
-
-def _failed(folder: Path, name: str) -> Path:
-    return folder / "failed" / f"{name}.parquet"
+def _file(folder: Path, name: str, kind: str = FINISHED) -> Path:
+    return folder / kind / f"{name}.parquet"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, unknown
 from ..plugins import file_digest, find, from_file, in_file
 from ..text import file_name
-from .cell import Cell, Params, Row, Scalar, digest, parse
+from .cell import Cell, Params, Row, Scalar, digest, entries, parse
 from .provenance import code_of
 
 if TYPE_CHECKING:
@@ -72,13 +72,13 @@ class Study:
     settings: Params = field(default_factory=dict)
     key: Callable[[Params], Params] = lambda params: {}
     prepare: Callable[[Sequence[Params], int], None] = lambda cells, jobs: None
-    where: Callable[[Params], bool] | None = None
+    where: Callable[[Params], bool] = lambda params: True
     shares: tuple[str, ...] = ()
     tables: "Mapping[str, Callable[[Results], Table | None]]" = field(default_factory=dict)
     figures: "Mapping[str, Callable[[Results], Plot | None]]" = field(default_factory=dict)
-    findings: "Callable[[Results], Mapping[str, str]] | None" = None
-    recipe: "Callable[[Results], Params] | None" = None
-    idle: "Callable[[Results], Collection[str]] | None" = None
+    findings: "Callable[[Results], Mapping[str, str]]" = lambda results: {}
+    recipe: "Callable[[Results], Params]" = lambda results: {}
+    idle: "Callable[[Results], Collection[str]]" = lambda results: ()
     limitations: tuple[str, ...] = ()
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
@@ -97,13 +97,14 @@ class Study:
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the parameters that vary, in order."""
-        if isinstance(self.grid, Mapping):
-            return tuple(self.grid)
-        return tuple(dict.fromkeys(name for params in self.grid for name in params))
+        return tuple(self.values())
 
-    def values(self) -> dict[str, tuple[Scalar, ...]]:
+    def values(self) -> dict[str, list[Scalar]]:
         """Values of each axis."""
-        return {name: tuple(_values(self.grid, name)) for name in self.axes}
+        if isinstance(self.grid, Mapping):
+            return {name: list(values) for name, values in self.grid.items()}
+        names = dict.fromkeys(name for params in self.grid for name in params)
+        return {name: list(dict.fromkeys(p[name] for p in self.grid if name in p)) for name in names}
 
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
@@ -122,22 +123,21 @@ class Study:
         >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).answers(None)
         {'a': 'It does.'}
         """
-        by_name = self.findings(results) if self.findings else {}
-        return {key: text for key, text in by_name.items() if text}
+        return {key: text for key, text in self.findings(results).items() if text}
 
     def override(self, changes: Params) -> "Study":
         """The same study with other settings, or other values on an axis (a list, or words split at commas).
 
         Text is read as the type of the default. On a list of parameter mappings an axis is filtered, not replaced.
         """
-        settings, grid = dict(self.settings), self.grid
+        settings, grid, axes = dict(self.settings), self.grid, self.values()
         for name, value in changes.items():
             if name in settings:
                 settings[name] = parse(name, value, settings[name])
-            elif name in self.axes:
-                grid = _narrow(grid, name, value)
+            elif name in axes:
+                grid = _narrow(grid, name, value, axes[name])
             else:
-                raise unknown("setting", name, [*settings, *self.axes])
+                raise unknown("setting", name, [*settings, *axes])
         changed = replace(self, settings=settings, grid=grid)
         for name in changes.keys() - settings.keys():
             _check_used(changed, name)
@@ -207,12 +207,12 @@ def points(study: Study) -> list[Mapping[str, Scalar]]:
     grid = study.grid
     if isinstance(grid, Mapping):
         grid = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
-    return [p for p in grid if study.where is None or study.where({**study.settings, **p})]
+    return [p for p in grid if study.where({**study.settings, **p})]
 
 
 def _check_used(study: Study, name: str) -> None:
     """InputError for a value on an axis that leads to no cell."""
-    if study.where is None or not isinstance(study.grid, Mapping):
+    if not isinstance(study.grid, Mapping):
         return
     used = {p[name] for p in points(study)}
     for value in study.grid[name]:
@@ -221,16 +221,10 @@ def _check_used(study: Study, name: str) -> None:
             raise InputError(name, repr(value), "leads to no cell under these settings", f"Write {name}={rest}.")
 
 
-def _values(grid: Any, name: str) -> list[Any]:
-    return list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
-
-
-def _narrow(grid: Any, name: str, value: Any) -> Any:
-    listed = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
-    values = _values(grid, name)
-    wanted = [parse(name, v, next((k for k in values if k is not None), None)) for v in listed]
+def _narrow(grid: Any, name: str, value: Any, values: Sequence[Scalar]) -> Any:
+    wanted = [parse(name, v, next((k for k in values if k is not None), None)) for v in entries(value)]
     if isinstance(grid, Mapping):
-        return {**grid, name: tuple(wanted)}
+        return {**grid, name: wanted}
     for v in wanted:
         if v not in values:
             raise InputError(name, repr(v), f"must be among {values}", "The grid of this study is a fixed list.")

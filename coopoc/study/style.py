@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..world.pictures import COLORS
+
 
 @dataclass(frozen=True)
 class Look:
@@ -44,17 +46,12 @@ TERMS: dict[str, str] = DATA["terms"]
 """Term -> meaning, which a page shows where a reader points at it."""
 RC: Any = DATA["matplotlib"]
 """Options of matplotlib."""
-_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
-"""Okabe and Ito, Color Universal Design (2008): distinguishable under the common forms of colour blindness."""
 CLIENTS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#4D4D4D")
 """Of the clients of one method, by number from 1."""
-_LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1, 1, 1)), "fitted": "-", "trained": "-"}
+_LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1, 1, 1))}
 
 SUFFIXES = {"m": "m", "s": "s", "hz": "Hz", "deg": "°"}
 """End of a column's name -> unit."""
-
-SYMBOLS = {"max_neighbours": "K"}
-"""Column -> the short form that fits over a column of numbers."""
 
 
 OWN: dict[str, str] = {}
@@ -77,8 +74,8 @@ def look(method: str) -> Look:
         color = CLIENTS[(int(number) - 1) % len(CLIENTS)] if number.isdecimal() else shown.color
         return Look(f"{shown.label} {number}", color, shown.marker)
     full_name, method = method, method.rpartition(".py:")[2]  # of a file: its name there
-    row, column = divmod(zlib.crc32(method.encode()) % 25, len(_COLORS))
-    return Look(OWN.get(full_name, method.replace("_", " ")), _COLORS[column], "<>d8H"[row])
+    row, column = divmod(zlib.crc32(method.encode()) % 25, 5)
+    return Look(OWN.get(full_name, method.replace("_", " ")), COLORS[column], "<>d8H"[row])
 
 
 def line(noise_model: object) -> Any:
@@ -93,8 +90,8 @@ def words(name: str) -> str:
     ('RT-LE [m]', 'Window')
     """
     stem, _, suffix = name.rpartition("_")
-    plain = (stem, SUFFIXES[suffix]) if stem and suffix in SUFFIXES else (name, "")
-    text, unit = UNITS.get(name, (plain[0].replace("_", " ").capitalize(), plain[1]))
+    unit = SUFFIXES.get(suffix, "") if stem else ""
+    text, unit = UNITS.get(name, ((stem if unit else name).replace("_", " ").capitalize(), unit))
     return f"{text} [{unit}]" if unit else text
 
 
@@ -106,7 +103,7 @@ def title(column: str, value: object) -> str:
     """
     if column in ("method", "noise_model"):
         return label(column, value)
-    return f"{SYMBOLS.get(column, words(column))} = {label(column, value)}"
+    return f"{'K' if column == 'max_neighbours' else words(column)} = {label(column, value)}"
 
 
 def label(column: str, value: object) -> str:

@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 from tabulate import tabulate
 
@@ -14,17 +15,14 @@ from ..arrays import one_of
 from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..text import markdown, spreadsheet, tex, visible
-from .numbers import Number, Where, alike
+from .numbers import Number, Results, Where, alike
 from .style import METHODS, label, title, words
-
-if TYPE_CHECKING:
-    from .results import Results
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
 REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
-SMOOTHERS = (METHODS["batch-smoother"].label,)
-"""Labels of methods that use later measurements, too: they are compared with each other alone."""
+SMOOTHER = METHODS["batch-smoother"].label
+"""Label of the method that uses later measurements, too: it is not compared with the others."""
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
 
@@ -91,6 +89,14 @@ class Table:
         text: str = getattr(self, f"to_{one_of('format', form, FORMATS)}")()
         return text
 
+    def save(self, path: str | Path) -> str:
+        """Write the table in each of FORMATS, path.md and so on, and return caption and notes."""
+        from . import store  # Arrow, which a mistake need not wait for
+
+        for form, suffix in FORMATS.items():
+            store.write(Path(f"{path}.{suffix}"), self.render(form))
+        return self.words
+
     def to_markdown(self) -> str:
         """GitHub Markdown, best in bold, the caption above and notes below."""
         body = self._body(markdown, "**{}**", " {}")
@@ -104,8 +110,9 @@ class Table:
         wide = [any(isinstance(row[j], Interval) for row in self.rows) for j in range(len(self.header))]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        titles = [(spreadsheet(title), w) for title, w in zip(self.header, wide, strict=True)]
-        writer.writerow([text + end for text, w in titles for end in (("", " low", " high") if w else ("",))])
+        ends = {False: ("",), True: ("", " low", " high")}
+        titles = zip(self.header, wide, strict=True)
+        writer.writerow([spreadsheet(title) + end for title, w in titles for end in ends[w]])
         for row in self.rows:
             writer.writerow([n for e, w in zip(row, wide, strict=True) for n in _columns(e, w)])
         return out.getvalue()
@@ -116,7 +123,7 @@ class Table:
         lines = [
             r"\begin{table}",
             r"\centering",
-            rf"\caption{{{tex(' '.join(self.words))}}}",
+            rf"\caption{{{tex(self.words)}}}",
             r"\smallskip",
             r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}",
@@ -136,27 +143,16 @@ class Table:
         for row, texts in zip(self.rows, shown, strict=True):
             kinds = ("" if isinstance(entry, str) else " class=number" for entry in row)
             body += f"<tr>{''.join(f'<td{kind}>{text}</td>' for kind, text in zip(kinds, texts, strict=True))}</tr>"
-        caption = f"<caption>{escape(visible(' '.join(self.words)))}</caption>"
+        caption = f"<caption>{escape(visible(self.words))}</caption>"
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
-    def _repr_html_(self) -> str:
-        """HTML for a notebook."""
-        return self.to_html()
-
-    def text(self, entry: Entry) -> str:
-        """One entry as text."""
-        if isinstance(entry, Interval):
-            low, high = (_number(end, self.decimals) for end in (entry.low, entry.high))
-            ends = f" [{low}, {high}]" if self.intervals and not math.isnan(entry.low) else ""
-            return _number(entry.mean, self.decimals) + ends
-        if isinstance(entry, float):
-            return _number(entry, self.decimals)
-        return "–" if entry is None else str(entry)
+    _repr_html_ = to_html
+    """HTML for a notebook."""
 
     @property
-    def words(self) -> list[str]:
+    def words(self) -> str:
         """Caption and notes."""
-        return [text for text in (self.caption, *self.notes) if text]
+        return " ".join(text for text in (self.caption, *self.notes) if text)
 
     def _body(self, escaped: Callable[[str], str], strong: str, ends: str) -> list[list[str]]:
         """Entries in a format: `strong` is the pattern of the best mean, `ends` that of an interval's ends."""
@@ -164,12 +160,16 @@ class Table:
         for i, row in enumerate(self.rows):
             texts = []
             for j, entry in enumerate(row):
-                text = self.text(entry)
-                mean, _, interval = text.partition(" ") if isinstance(entry, Interval) else (text, "", "")
-                shown = strong.format(escaped(mean)) if (i, j) in bold else escaped(mean)
-                texts.append(shown + (ends.format(interval) if interval else ""))
+                mean = entry.mean if isinstance(entry, Interval) else entry
+                text = escaped(self._number(mean) if isinstance(mean, float) else "–" if mean is None else str(mean))
+                texts.append(strong.format(text) if (i, j) in bold else text)
+                if isinstance(entry, Interval) and self.intervals and not math.isnan(entry.low):
+                    texts[-1] += ends.format(f"[{self._number(entry.low)}, {self._number(entry.high)}]")
             body.append(texts)
         return body
+
+    def _number(self, value: float) -> str:
+        return "–" if math.isnan(value) else f"{value:.{self.decimals}f}"
 
     def _sides(self, left: str, right: str) -> tuple[str, ...]:
         """Alignment of each column: text at the left, numbers at the right."""
@@ -194,13 +194,13 @@ class Table:
             for j, entry in enumerate(row):
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                if isinstance(mean, float) and math.isfinite(mean) and not names & {*self.unranked, *SMOOTHERS}:
+                if isinstance(mean, float) and math.isfinite(mean) and not names & {*self.unranked, SMOOTHER}:
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         return [sorted(group, reverse=self.best == "max") for group in places.values()]
 
 
 def pivot(
-    results: "Results",
+    results: Results,
     rows: str | Sequence[str],
     columns: str | Sequence[str],
     value: str,
@@ -229,26 +229,28 @@ def pivot(
     down, across = ([names] if isinstance(names, str) else list(names) for names in (rows, columns))
     summary = results.summary([*down, *across], value, where)
     same = [name for name in down if len(down) > 1 and summary[name].nunique(dropna=False) == 1]
-    caption = " ".join([caption or f"{words(value)}: mean and 95 % interval.", *(_all(summary[s]) for s in same)])
+    in_all = [f"{words(name)}: {label(name, summary[name].iloc[0])}." for name in same]  # and no column
+    caption = " ".join([caption or f"{words(value)}: mean and 95 % interval.", *in_all])
     down = [name for name in down if name not in same] or down[:1]
-    summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
-    titles = list(dict.fromkeys(summary["_title"]))
-    body, of = [], dict[tuple[Entry, ...], dict[str, Any]]()
-    for names, group in summary.groupby(down, sort=False, dropna=False):
-        entries = {
-            row["_title"]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
-            for _, row in group.iterrows()
-            if row["n"]
-        }
-        body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(entries.get, titles)))
-        of[body[-1]] = {row["_title"]: row for _, row in group.iterrows()}
-    missing, smoothed = int(summary["missing"].sum()), [row for row in body if set(SMOOTHERS) & {*map(str, row)}]
+    titles, of = dict[str, None](), dict[tuple[Entry, ...], dict[str, Any]]()
+    for row in summary.to_dict("records"):
+        text = ", ".join(title(name, row[name]) for name in across)
+        titles[text] = None
+        of.setdefault(tuple(label(name, row[name]) for name in down), {})[text] = row
+    body = []
+    for labels in sorted(of, key=lambda labels: SMOOTHER in labels):
+        found = (of[labels].get(text) for text in titles)
+        entries = (
+            Interval(row["mean"], row["low"], row["high"], row["n"]) if row and row["n"] else None for row in found
+        )
+        body.append((*labels, *entries))
+    missing = int(summary["missing"].sum())
     gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
-    if smoothed and best:
-        gone.append(f"{', '.join(SMOOTHERS)}: knows later measurements, too, and is not ranked.")
+    if best and any(SMOOTHER in labels for labels in of):
+        gone.append(f"{SMOOTHER}: knows later measurements, too, and is not ranked.")
     made = Table(
         (*map(words, down), *titles),
-        (*(row for row in body if row not in smoothed), *smoothed),
+        tuple(body),
         caption,
         best,
         "column" if "method" in down else "row",
@@ -256,23 +258,18 @@ def pivot(
         intervals=intervals,
         notes=(*gone, *lost(results, where)),
     )
-    keys, same_as_best = [*dict.fromkeys((*down, *across))], list[tuple[int, int]]()
+    same_as_best = list[tuple[int, int]]()
     for ranked in made.ranked():
-        first, *others = (of[made.rows[i]][made.header[j]] for _, i, j in ranked)
+        first, *others = (of[made.rows[i][: len(down)]][made.header[j]] for _, i, j in ranked)
         for (_, i, j), row in zip(ranked[1:], others, strict=True):
             near = max(row["low"], first["low"]) <= min(row["high"], first["high"])  # else pairs are apart, too
-            one, other = ({**(where or {}), **each[keys]} for each in (first, row))
+            one, other = ({**(where or {}), **{k: each[k] for k in (*down, *across)}} for each in (first, row))
             if near and alike(results, one, other, value):
                 same_as_best.append((i, j))
     return replace(made, alike=tuple(same_as_best))
 
 
-def _all(column: Any) -> str:
-    """What is the same in every row, and no column."""
-    return f"{words(str(column.name))}: {label(str(column.name), column.iloc[0])}."
-
-
-def lost(results: "Results", where: Where | None = None) -> list[str]:
+def lost(results: Results, where: Where | None = None) -> list[str]:
     """A sentence for each method whose estimates left the fixes by more than 100 standard deviations."""
     frame = results.select(where or {})
     if "left_fixes" not in frame or "method" not in frame:
@@ -286,7 +283,7 @@ ALIKE, WORSE = 1e-3, 1.1
 """m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
 
 
-def unused(results: "Results", real: bool) -> list[str]:
+def unused(results: Results, real: bool) -> list[str]:
     """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego, or on
     real data larger."""
     rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
@@ -315,7 +312,7 @@ def unused(results: "Results", real: bool) -> list[str]:
 
 
 def crossed(
-    results: "Results",
+    results: Results,
     head: Sequence[str],
     rows: Iterable[tuple[Sequence[Entry], Where]],
     columns: Mapping[str, Number],
@@ -342,10 +339,6 @@ def crossed(
             body.append((*labels, *entries))
     options["notes"] = (*options.get("notes", ()), *lost(results))
     return Table((*head, *columns), tuple(body), caption, **options) if body else None
-
-
-def _number(value: float, decimals: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{decimals}f}"
 
 
 def _columns(entry: Entry, wide: bool) -> list[object]:
