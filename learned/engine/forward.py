@@ -94,9 +94,9 @@ def start(state: State, x0: Floats, rows: tuple[Index, Index, Index]) -> None:
         for j in range(CELLS):
             state.process[lane, j] = state.innovation[lane, j] = 1.0 if j % 4 == 0 else 0.0
             state.prior[lane, j] = 0.0
-        for i in range(3):
-            state.x[lane, i] = state.x_before[lane, i] = x0[s, first + lane, i]
-            state.prior_before[lane, i] = state.gnss_before[lane, i] = x0[s, first + lane, i]
+        for position in state[3:]:
+            for i in range(3):
+                position[lane, i] = x0[s, first + lane, i]
 
 
 @part
