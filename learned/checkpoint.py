@@ -49,7 +49,7 @@ class Checkpoint:
         if self.history is None or not 0 <= row < len(self.history):
             held = 0 if self.history is None else len(self.history)
             raise InputError("row", row, f"must be in 0..{held - 1}", "This checkpoint holds no more weights.")
-        return unflatten(self.history[row][None], self.model)[0]
+        return unflatten(self.history[row], self.model)
 
     def kept(self, row: int) -> int:
         """Row up to `row` whose weights validated best: those kept by a training that ended there.
