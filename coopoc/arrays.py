@@ -67,10 +67,9 @@ def checked(
     if array.dtype.kind not in kinds and (array.size or array.dtype == object):
         hint = "Convert it with numpy first: rows must be equally long, text is not parsed, floats are not rounded."
         raise InputError(field, f"dtype {array.dtype}", f"must be an array of {word}s", hint)
-    wrong = shape is not None and (
+    if shape is not None and (
         array.ndim != len(shape) or any(n not in (size, -1) for n, size in zip(shape, array.shape, strict=True))
-    )
-    if shape is not None and wrong:
+    ):
         wanted = str(tuple("any" if n < 0 else n for n in shape)).replace("'", "")
         allowed = f"must have shape {axes} = {wanted}"
         raise InputError(field, f"shape {array.shape}", allowed, "Give one entry per index of each axis.")

@@ -25,6 +25,8 @@ from .nets.gain import Gain
 from .nets.stack import unflatten
 
 _HISTORY, CHECKSUM = "history", "checksum"
+MADE_WITH = ("coopoc", "torch", "numpy")
+"""What a card has the versions of, beside Python's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,7 @@ class Checkpoint:
         if self.history is None or not 0 <= row < len(self.history):
             held = 0 if self.history is None else len(self.history)
             raise InputError("row", row, f"must be in 0..{held - 1}", "This checkpoint holds no more weights.")
-        return unflatten(self.history[row][None], self.model)[0]
+        return unflatten(self.history[row], self.model)
 
     def kept(self, row: int) -> int:
         """Row up to `row` whose weights validated best: those kept by a training that ended there.
@@ -73,7 +75,7 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     """
     path, model = given_path(path), instance("checkpoint", checkpoint, Checkpoint).model
     card = dict(checkpoint.card) | {
-        "environment": environment(),
+        "environment": {"python": platform.python_version()} | {name: version(name) for name in MADE_WITH},
         "kind": kind(model),
         "net": dict(model.settings),
         "parameters": sum(p.numel() for p in model.parameters()),
@@ -165,11 +167,6 @@ def read_card(path: Path | str) -> Mapping[str, Any]:
     """The card alone, without its weights."""
     with _opened(given_path(path)) as file:
         return _card(file, path)
-
-
-def environment() -> dict[str, str]:
-    """Versions that a checkpoint was made with."""
-    return {"python": platform.python_version()} | {name: version(name) for name in ("coopoc", "torch", "numpy")}
 
 
 def _opened(path: Path) -> Any:

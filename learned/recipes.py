@@ -4,12 +4,12 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 
 from coopoc import InputError, Method, Outliers, Sensors
-from coopoc.arrays import check_fields, instance, one_of
+from coopoc.arrays import check_fields, instance
 from coopoc.errors import unknown
 from coopoc.plugins import file_digest, find, in_file
 from coopoc.text import given_path
@@ -25,8 +25,8 @@ from .training.schedule import STEPS, Schedule
 
 REVISION = 7
 """Raised whenever the training code changes what it makes of the same recipe."""
-KINDS = ("federated", "centralised", "individual", "okf")
-"""Kinds of training."""
+Kind = Literal["federated", "centralised", "individual", "okf"]
+"""Of training."""
 STATIC = "static"
 """Noise of recipes: the paper's."""
 WEIGHTS = Path(__file__).parent / "weights"
@@ -59,7 +59,7 @@ class Recipe:
     trainable: ClassVar[bool] = True
     """Studies and commands train it first when it is named as a method."""
 
-    kind: str
+    kind: Kind
     schedule: Schedule = Schedule()
     rounds: int = 20
     local_epochs: int = 5
@@ -71,7 +71,6 @@ class Recipe:
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        one_of("kind of recipe", self.kind, KINDS)
         check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
         if self.noise != STATIC:
             Outliers.named(self.noise)

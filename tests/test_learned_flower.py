@@ -96,7 +96,7 @@ def room(nodes: Mapping[int, Node]) -> Any:
 
 def deployed(job: Job, nodes: Mapping[int, Node]) -> tuple[list[Row], Federation]:
     rows: list[Row] = []
-    rounds(room(nodes), job, len(nodes), 5.0, rows.append)
+    rounds(room(nodes), job, len(nodes), 5.0, rows.append, {})
     return rows, federation(rows, job, 0.0)
 
 
@@ -255,9 +255,9 @@ def test_a_silent_client_is_absent_and_welcome_back():
 
 def test_too_few_nodes_end_the_run():
     with pytest.raises(TimeoutError, match="only 1 came online in 0 s"):
-        rounds(room({1: lambda _: None}), job_of(TINY), 2, 0.0, print)
+        rounds(room({1: lambda _: None}), job_of(TINY), 2, 0.0, print, {})
     with refused("aggregate = 'uniform'"):
-        rounds(room({1: lambda _: None}), job_of(TINY | {"aggregate": "uniform"}), 1, 1.0, print)
+        rounds(room({1: lambda _: None}), job_of(TINY | {"aggregate": "uniform"}), 1, 1.0, print, {})
 
 
 def test_the_text_of_an_error_stays_in_the_client(tmp_path, capsys):

@@ -28,7 +28,7 @@ from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.learned import load
 from coopoc.learned.federation.local import local_fit
-from coopoc.learned.flower.job import job_of, local
+from coopoc.learned.flower.job import job_of
 from coopoc.learned.recipes import Job, job_clients, untrained
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,11 +97,11 @@ def until(true: Callable[[], bool], seconds: float = 300, alive: "subprocess.Pop
 def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
     """The card of a checkpoint whose weights are, round by round, NumPy's average of what the clients that counted
     made."""
-    recipe, found = job.recipe, load(path)
+    plan, found = job.recipe.plan, load(path)
     for row, theta, before in zip(found.card["history"][1:], found.history[1:], found.history[:-1], strict=True):
         own = [c for c in job_clients(job, fleet) if c.name not in row["absent"].keys() | row["rejected"].keys()]
         fitted = [
-            local_fit(untrained(job), before, c, job.setting.seed, row["round"], recipe.rounds, local(job))[0].numpy()
+            local_fit(untrained(job), before, c, job.setting.seed, row["round"], plan.rounds, plan.local)[0].numpy()
             for c in own
         ]
         sizes = [len(client.training) for client in own]

@@ -9,7 +9,7 @@ from .g2o import read_g2o
 from .graph import Graph
 from .pyfg import read_pyfg
 
-GRAPHS = {".pyfg": read_pyfg, ".g2o": read_g2o}
+GRAPHS = (".pyfg", ".g2o")
 
 
 def load_graph(path: str | Path, repair: bool = False) -> Graph:
@@ -27,9 +27,11 @@ def load_graph(path: str | Path, repair: bool = False) -> Graph:
     coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o. Rename or convert the file.
     """
     suffix = given_path(path).suffix
-    if suffix not in GRAPHS and (fetched := find("coopoc.readers", "fetched")(str(path))):
+    if suffix == ".pyfg":
+        return read_pyfg(path)
+    if suffix == ".g2o":
+        return read_g2o(path, repair)
+    if fetched := find("coopoc.readers", "fetched")(str(path)):
         return load_graph(fetched, repair)
-    if suffix not in GRAPHS:
-        hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
-        raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)
-    return read_g2o(path, repair) if suffix == ".g2o" else GRAPHS[suffix](path)
+    hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
+    raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)

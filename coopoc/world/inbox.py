@@ -57,9 +57,8 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     link = recording.links.of(ego)
     at = recording.links.step[link]
     start, size = np.searchsorted(at, np.arange(steps + 1)), message.size(recording.v2x.overhead)
-    sent = np.full(len(link), size)
     sender = recording.links.neighbour[link]
-    arrival = within_cap(recording.arrival.take(link, axis=1), sent, start, sender, recording)
+    arrival = within_cap(recording.arrival.take(link, axis=1), size, start, sender, recording)
     arrival = np.where(arrival < steps, arrival, -1)
     newest, fresh = _newest(arrival, at, sender, steps)
     too_old = at - newest > recording.v2x.max_age / recording.dt + 1e-9
@@ -97,10 +96,10 @@ def _newest_of_pair(arrival: Ints, sent: Ints, steps: int) -> Ints:
     return np.maximum.accumulate(held, axis=1)
 
 
-def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: Recording) -> Ints:
+def within_cap(arrival: Ints, size: int, start: Ints, sender: Ints, recording: Recording) -> Ints:
     """Arrivals (R, M) with -1 for messages that a token bucket rejects.
 
-    The bucket holds what one second brings, or the largest message if that is more; it is full at the first step, as in
+    The bucket holds what one second brings, or a message if that is more; it is full at the first step, as in
     RFC 2697 (section 3), and it fills by `bytes_per_second` times dt a step. A message that arrives is accepted if
     there are tokens for all of it. Of those that arrive together the nearest sender's is first, or in round robin that
     of the sender whose last accepted message is oldest.
@@ -108,15 +107,15 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: 
     Args:
         arrival: (R, M) steps at one receiver, by sending step and then nearest first; those of one sending step arrive
             together.
-        size: (M,) bytes on air.
+        size: bytes of each on air.
         start: (T+1,) start[t]:start[t+1] are sent at step t.
         sender: (M,) columns.
         recording: its V2X has the cap and the schedule.
     """
     cap = recording.v2x.bytes_per_second
-    if not np.isfinite(cap) or not size.any():
+    if not np.isfinite(cap) or not size:
         return arrival
-    depth = float(max(cap, int(size.max()))) if cap else 0.0
+    depth = float(max(cap, size)) if cap else 0.0
     accepted, last_accepted = np.full_like(arrival, -1), np.full((len(arrival), len(recording.ids)), -1)
     tokens, last = np.full(len(arrival), depth), 0
     for t, span in enumerate(map(slice, start[:-1].tolist(), start[1:].tolist())):
@@ -125,7 +124,7 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: 
             continue
         now = int(arrival[:, span].max())
         tokens, last = np.minimum(tokens + cap * recording.dt * (now - last), depth), now
-        while (fits := left & (size[span] <= tokens[:, None] + 1e-9)).any():
+        while (fits := left & (size <= tokens[:, None] + 1e-9)).any():
             run = np.flatnonzero(fits.any(axis=1))
             waited = 0 if recording.v2x.schedule == "nearest" else t - last_accepted[:, sender[span]]
             best = np.where(fits, waited, -1)[run].argmax(axis=1)
@@ -133,5 +132,5 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: 
             last_accepted[run, sender[message]] = t
             left[run, best] = False
             accepted[run, message] = arrival[run, message]
-            tokens[run] -= size[message]
+            tokens[run] -= size
     return accepted

@@ -353,9 +353,13 @@ def check_links(
     for name, values in columns.items():
         refuse(name, values, (values < 0) | (values >= vehicles), f"must be in 0..{vehicles - 1}", "Name a column.")
     refuse("links.step", links.step, links.step >= steps, f"must be in 0..{steps - 1}", "Drop the links after the end.")
-    observes = np.zeros(vehicles, dtype=bool)
-    observes[list(observers)] = True
-    refuse("links.observer", links.observer, ~observes[links.observer], "must be among the observers", "Add it there.")
+    refuse(
+        "links.observer",
+        links.observer,
+        ~np.isin(links.observer, observers),
+        "must be among the observers",
+        "Add it there.",
+    )
     absent = np.isnan(velocity[0, :, :, 0])
     for name in ("observer", "neighbour"):
         column = getattr(links, name)

@@ -127,15 +127,15 @@ def back(
 def correct_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index, gone: bool) -> None:
     """`forward.correct` backwards: the gradient of gain, innovation and new states; without a fix it is zero."""
     columns, zero = net.columns, tape.dtype.type(0.0)
-    gain, residual = columns[on.GAIN], columns[on.RESIDUAL]
-    process, innovation, posterior = columns[on.PROCESS], columns[on.INNOVATION], columns[on.POSTERIOR]
+    gain, residual = columns.gain, columns.residual
+    process, innovation, posterior = columns.process, columns.innovation, columns.posterior
     for j in range(3):
         gradient[residual + j] = zero
         for i in range(3):
             along = zero if gone else adjoint.x[lane, i]
             gradient[gain + 3 * i + j] = along * tape[residual + j]
             gradient[residual + j] += along * tape[gain + 3 * i + j]
-    gradient[columns[on.EVOLVED] : columns[on.PRIOR_OLD]] = zero
+    gradient[columns.evolved : columns.prior_old] = zero
     for j in range(CELLS):
         gradient[process + j] = zero if gone else adjoint.process[lane, j]
         gradient[innovation + j] = zero if gone else adjoint.innovation[lane, j]
@@ -145,29 +145,28 @@ def correct_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane:
 @part
 def infer_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
     """`forward.infer` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
-    prior, copy = net.columns[on.PRIOR], net.columns[on.PRIOR_COPY]
+    columns = net.columns
     backward_layer(net, on.L_POSTERIOR, tape, gradient, row, lanes)
     for lane in range(row, row + lanes):
         for j in range(CELLS):
-            gradient[lane, prior + j] = gradient[lane, copy + j]
+            gradient[lane, columns.prior + j] = gradient[lane, columns.prior_copy + j]
     backward_layer(net, on.L_BACK, tape, gradient, row, lanes)
     backward_layer(net, on.L_GAIN, tape, gradient, row, lanes)
     backward_layer(net, on.L_HIDDEN, tape, gradient, row, lanes)
-    gru_back(net, on.L_INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION, tape, gradient, row, lanes)
+    gru_back(net, on.L_INNOVATION_X, columns.innovation_old, columns.innovation, tape, gradient, row, lanes)
     backward_layer(net, on.L_OBSERVATION, tape, gradient, row, lanes)
     backward_layer(net, on.L_EXPECTED, tape, gradient, row, lanes)
-    gru_back(net, on.L_PRIOR_X, on.PRIOR_OLD, on.PRIOR, tape, gradient, row, lanes)
+    gru_back(net, on.L_PRIOR_X, columns.prior_old, columns.prior, tape, gradient, row, lanes)
     backward_layer(net, on.L_EVOLUTION, tape, gradient, row, lanes)
-    gru_back(net, on.L_PROCESS_X, on.PROCESS_OLD, on.PROCESS, tape, gradient, row, lanes)
+    gru_back(net, on.L_PROCESS_X, columns.process_old, columns.process, tape, gradient, row, lanes)
     backward_layer(net, on.L_UPDATE, tape, gradient, row, lanes)
 
 
 @part
 def gru_back(
-    net: Net, layer: Index, field: Index, to: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index
+    net: Net, layer: Index, old: Index, new: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index
 ) -> None:
     """`forward.gru` backwards."""
-    old, new = net.columns[field], net.columns[to]
     for lane in range(row, row + lanes):
         after, unit = gradient[lane, new : new + CELLS], gradient[lane, old : old + GATES]
         blend_back(tape[lane, old : old + 8 * PAD], after, unit)
@@ -194,8 +193,8 @@ def blend_back(unit: Floats, after: Floats, gradient: Floats) -> None:
 @part
 def features_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
     """`forward.features` backwards, and `adjoint` of the state of a lane before the step."""
-    real, at, columns = tape.dtype.type, net.columns[on.CHANGES], net.columns
-    residual, lengths = columns[on.RESIDUAL], columns[on.LENGTHS]
+    real, at, columns = tape.dtype.type, net.columns.changes, net.columns
+    residual, lengths = columns.residual, columns.lengths
     for change in range(1, 4):
         c = at + 3 * change
         u, v, w, p, q, r = tape[c], tape[c + 1], tape[c + 2], gradient[c], gradient[c + 1], gradient[c + 2]
@@ -212,7 +211,7 @@ def features_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane
         adjoint.x[lane, i] += adjoint.prior_before[lane, i] + adjoint.x_before[lane, i]
         adjoint.x[lane, i] += evolved + updated - in_residual
         adjoint.x_before[lane, i], adjoint.prior_before[lane, i] = -evolved, -updated
-    process, prior, innovation = columns[on.PROCESS_OLD], columns[on.PRIOR_OLD], columns[on.INNOVATION_OLD]
+    process, prior, innovation = columns.process_old, columns.prior_old, columns.innovation_old
     for j in range(CELLS):
         adjoint.process[lane, j], adjoint.prior[lane, j] = gradient[process + j], gradient[prior + j]
         adjoint.innovation[lane, j] = gradient[innovation + j]

@@ -94,9 +94,9 @@ def start(state: State, x0: Floats, rows: tuple[Index, Index, Index]) -> None:
         for j in range(CELLS):
             state.process[lane, j] = state.innovation[lane, j] = 1.0 if j % 4 == 0 else 0.0
             state.prior[lane, j] = 0.0
-        for i in range(3):
-            state.x[lane, i] = state.x_before[lane, i] = x0[s, first + lane, i]
-            state.prior_before[lane, i] = state.gnss_before[lane, i] = x0[s, first + lane, i]
+        for position in state[3:]:
+            for i in range(3):
+                position[lane, i] = x0[s, first + lane, i]
 
 
 @part
@@ -112,8 +112,8 @@ def features(
 ) -> None:
     """Input features of GainNet: directions and lengths of four differences, and the innovation; a missing fix repeats
     the last."""
-    real, at = tape.dtype.type, net.columns[on.CHANGES]
-    residual, lengths = net.columns[on.RESIDUAL], net.columns[on.LENGTHS]
+    real, at = tape.dtype.type, net.columns.changes
+    residual, lengths = net.columns.residual, net.columns.lengths
     s, first, lanes = rows
     for lane in range(lanes):
         gone, own, b = missing(drives.gnss, (t, s, first + lane)), tape[row + lane], first + lane
@@ -136,31 +136,32 @@ def features(
 @part
 def infer(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> None:
     """Forward pass of the GRUs, from the features to the gain and the posterior."""
+    columns = net.columns
     forward_layer(net, on.L_UPDATE, tape, row, lanes)
-    gru(net, on.L_PROCESS_X, on.PROCESS_OLD, on.PROCESS, state.process, tape, row, lanes)
+    gru(net, on.L_PROCESS_X, columns.process_old, columns.process, state.process, tape, row, lanes)
     forward_layer(net, on.L_EVOLUTION, tape, row, lanes)
-    gru(net, on.L_PRIOR_X, on.PRIOR_OLD, on.PRIOR, state.prior, tape, row, lanes)
+    gru(net, on.L_PRIOR_X, columns.prior_old, columns.prior, state.prior, tape, row, lanes)
     forward_layer(net, on.L_EXPECTED, tape, row, lanes)
     forward_layer(net, on.L_OBSERVATION, tape, row, lanes)  # after `expected`, whose last vector reaches into it
-    gru(net, on.L_INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION, state.innovation, tape, row, lanes)
+    gru(net, on.L_INNOVATION_X, columns.innovation_old, columns.innovation, state.innovation, tape, row, lanes)
     forward_layer(net, on.L_HIDDEN, tape, row, lanes)
     forward_layer(net, on.L_GAIN, tape, row, lanes)
     forward_layer(net, on.L_BACK, tape, row, lanes)
-    prior, copy = net.columns[on.PRIOR], net.columns[on.PRIOR_COPY]
     for lane in range(row, row + lanes):
         for j in range(CELLS):
-            tape[lane, copy + j] = tape[lane, prior + j]
+            tape[lane, columns.prior_copy + j] = tape[lane, columns.prior + j]
     forward_layer(net, on.L_POSTERIOR, tape, row, lanes)
 
 
 @part
-def gru(net: Net, layer: Index, field: Index, to: Index, state: Floats, tape: Floats, row: Index, lanes: Index) -> None:
+def gru(
+    net: Net, layer: Index, old: Index, begin: Index, state: Floats, tape: Floats, row: Index, lanes: Index
+) -> None:
     """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h' = n + z (h - n), biases in W and U.
 
     The fields of a GRU follow each other: old state, W x, U h, gates. Gates are computed over PAD columns, of which
     nine count, because loops of such a length vectorise.
     """
-    old, begin = net.columns[field], net.columns[to]
     for lane in range(lanes):
         for j in range(CELLS):
             tape[row + lane, old + j] = state[lane, j]
@@ -190,7 +191,7 @@ def blend(unit: Floats, new: Floats) -> None:
 def correct(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: tuple[Index, Index, Index]) -> None:
     """x <- x_prior + K (z - x_prior) and the new states of a lane; without a fix x <- x_prior and nothing else."""
     t, s, b = at
-    gone, gain, residual = missing(drives.gnss, at), net.columns[on.GAIN], net.columns[on.RESIDUAL]
+    gone, gain, residual = missing(drives.gnss, at), net.columns.gain, net.columns.residual
     for i in range(3):
         state.x_before[lane, i] = state.x[lane, i]
         state.x[lane, i] += drives.dt[t] * drives.velocity[t, s, b, i]
@@ -199,7 +200,7 @@ def correct(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, a
             for j in range(3):
                 state.x[lane, i] += tape[gain + 3 * i + j] * tape[residual + j]
     if not gone:
-        process, innovation, posterior = net.columns[on.PROCESS], net.columns[on.INNOVATION], net.columns[on.POSTERIOR]
+        process, innovation, posterior = net.columns.process, net.columns.innovation, net.columns.posterior
         for j in range(CELLS):
             state.process[lane, j], state.innovation[lane, j] = tape[process + j], tape[innovation + j]
             state.prior[lane, j] = tape[posterior + j]

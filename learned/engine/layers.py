@@ -30,48 +30,43 @@ ZEROS = 512
 Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 """Names and shapes of a net's parameters, in the order of theta."""
 
-_NAMED = (
-    "changes corrected process_old process_x process_h process_gates process evolved "
-    "prior_old prior_x prior_h prior_gates expected observed "
-    "innovation_old innovation_x innovation_h innovation_gates prior innovation gain "
-    "hidden prior_copy back posterior residual lengths"
-)
-FIELDS = _NAMED.split()
-"""Fields of the tape, in their order: [process, evolved], [expected, observed], [prior, innovation, gain] and
-[prior_copy, back] stand side by side, because layers read two of them at once. `changes` holds the directions of the
-four changes: of the fix, innovation, evolution, update."""
+
+class Columns(NamedTuple):
+    """First column of each field of the tape, in their order: [process, evolved], [expected, observed], [prior,
+    innovation, gain] and [prior_copy, back] stand side by side, because layers read two of them at once. `changes`
+    holds the directions of the four changes: of the fix, innovation, evolution, update."""
+
+    changes: int
+    corrected: int
+    process_old: int
+    process_x: int
+    process_h: int
+    process_gates: int
+    process: int
+    evolved: int
+    prior_old: int
+    prior_x: int
+    prior_h: int
+    prior_gates: int
+    expected: int
+    observed: int
+    innovation_old: int
+    innovation_x: int
+    innovation_h: int
+    innovation_gates: int
+    prior: int
+    innovation: int
+    gain: int
+    hidden: int
+    prior_copy: int
+    back: int
+    posterior: int
+    residual: int
+    lengths: int
+
+
 TOGETHER = ("process", "expected", "prior", "innovation", "prior_copy")
 """Fields that end where the next one begins; the others have room for the last vector of what is written there."""
-(
-    CHANGES,
-    CORRECTED,
-    PROCESS_OLD,
-    PROCESS_X,
-    PROCESS_H,
-    PROCESS_GATES,
-    PROCESS,
-    EVOLVED,
-    PRIOR_OLD,
-    PRIOR_X,
-    PRIOR_H,
-    PRIOR_GATES,
-    EXPECTED,
-    OBSERVED,
-    INNOVATION_OLD,
-    INNOVATION_X,
-    INNOVATION_H,
-    INNOVATION_GATES,
-    PRIOR,
-    INNOVATION,
-    GAIN,
-    HIDDEN,
-    PRIOR_COPY,
-    BACK,
-    POSTERIOR,
-    RESIDUAL,
-    LENGTHS,
-) = np.arange(len(FIELDS))
-
 _ROWS = (
     "update.weight changes 9 corrected 1 1",
     "evolution.weight changes 6 evolved 1 1",
@@ -114,7 +109,7 @@ class Plan(NamedTuple):
     `Net.matrices`, number of parameters."""
 
     layers: Ints
-    columns: Ints
+    columns: Columns
     width: int
     size: int
     parameters: int
@@ -128,7 +123,7 @@ class Net(NamedTuple):
 
     matrices: Floats
     layers: Ints
-    columns: Ints
+    columns: Columns
 
 
 @cache
@@ -139,9 +134,9 @@ def plan_of(shapes: Shapes) -> Plan:
         begin[name] = at
         at += math.prod(shape)
     widths = {target: sizes[name][0] for name, _, _, target, _, _ in LAYERS}
-    widths |= {name: 3 * PAD for name in FIELDS if name.endswith("gates")} | {"changes": 9 + PAD}
+    widths |= {name: 3 * PAD for name in Columns._fields if name.endswith("gates")} | {"changes": 9 + PAD}
     columns, end = {}, 0
-    for name in FIELDS:
+    for name in Columns._fields:
         columns[name], width = end, widths.get(name, CELLS)
         end += width if name in TOGETHER else whole(end + whole(width)) - end
     rows, size = [], 0
@@ -165,7 +160,7 @@ def plan_of(shapes: Shapes) -> Plan:
             ]
         )
         size = bias + whole(outputs)
-    return Plan(np.array(rows), np.array(list(columns.values())), end, size, at)
+    return Plan(np.array(rows), Columns(**columns), end, size, at)
 
 
 def whole(columns: int) -> int:

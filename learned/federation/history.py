@@ -143,7 +143,7 @@ class Federation:
         """The global net after round `number`, 0 being the start."""
         if not 0 <= number < len(self.history):
             raise InputError("round", number, f"must be in 0..{len(self.history) - 1}", "See history.")
-        return unflatten(self.history[number].weights[None], self.like)[0]
+        return unflatten(self.history[number].weights, self.like)
 
 
 def _or_infinite(loss: float) -> float:

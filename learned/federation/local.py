@@ -46,7 +46,7 @@ def local_fit(
     weights, members, key = theta.detach().clone()[None], [np.arange(len(client.training))], [(seed, client.name)]
     with one_core():
         loss, stopped = adapt(weights, model, client.training, members, key, number, rounds, local)
-    return weights[0], float(loss[0]), stopped.get(0)
+    return weights[0], loss[0], stopped.get(0)
 
 
 def adapt(
@@ -58,7 +58,7 @@ def adapt(
     number: int,
     rounds: int,
     local: Schedule,
-) -> tuple[Tensor, dict[int, str]]:
+) -> tuple[list[float], dict[int, str]]:
     """Local training of every client in round `number`, in place: a pure function of weights, data and (seed, client).
 
     Args:
@@ -80,8 +80,8 @@ def adapt(
     rates = [local.learning_rate * cosine(len(plan), *span) for plan in plans]
     draws, stopped = [generator(draw) for draw in streams], dict[int, str]()
     losses = torch.stack([loss for _, loss in descend(theta, like, pool, plans, rates, local, draws, stopped)], 1)
-    means = [math.nan if r in stopped else losses[r, : len(plan)].mean() for r, plan in enumerate(plans)]
-    return torch.tensor(means), stopped
+    means = [math.nan if r in stopped else float(losses[r, : len(plan)].mean()) for r, plan in enumerate(plans)]
+    return means, stopped
 
 
 class Work(NamedTuple):
@@ -128,7 +128,7 @@ class Stack(NamedTuple):
         for i, team in enumerate(self.teams):
             here = {name: trained[i, name] for name in team.names if name in asked[i]}
             weights = {name: theta[at] for name, at in here.items() if at not in stopped}
-            own = tuple(float(losses[here[name]]) if name in here else math.nan for name in team.names)
+            own = tuple(losses[here[name]] if name in here else math.nan for name in team.names)
             works.append(Work(weights, own, {name: stopped[at] for name, at in here.items() if at in stopped}))
         return works
 

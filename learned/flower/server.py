@@ -120,7 +120,7 @@ def rounds(
     nodes: int,
     timeout: float,
     keep: Callable[[Row], object],
-    names: dict[int, str] | None = None,
+    names: dict[int, str],
 ) -> None:
     """The rounds of a federation over a grid, by the Flower strategy of the recipe's rule.
 
@@ -143,8 +143,7 @@ def rounds(
     (theta,) = flatten([untrained(job)])
     one_of("aggregate", job.recipe.aggregate, tuple(STRATEGIES))
     job.recipe.plan.check(nodes)
-    named = {} if names is None else names
-    strategy, until = _strategy(job.recipe.aggregate, theta, keep, named), time.monotonic() + timeout
+    strategy, until = _strategy(job.recipe.aggregate, theta, keep, names), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:
         if time.monotonic() > until:
             state = f"only {online} came online in {timeout:g} s"

@@ -19,14 +19,11 @@ def flatten(models: Sequence[nn.Module]) -> Tensor:
     return torch.stack([nn.utils.parameters_to_vector(m.parameters()).detach() for m in models])
 
 
-def unflatten(theta: Tensor, like: Net) -> list[Net]:
-    """New models shaped as `like` with the weights theta (S, P)."""
-    models = []
-    for row in theta:
-        model = copy.deepcopy(like)
-        nn.utils.vector_to_parameters(row.detach().clone(), model.parameters())
-        models.append(model)
-    return models
+def unflatten(weights: Tensor, like: Net) -> Net:
+    """A new model shaped as `like` with the weights (P,)."""
+    model = copy.deepcopy(like)
+    nn.utils.vector_to_parameters(weights.detach().clone(), model.parameters())
+    return model
 
 
 def named(theta: Tensor, like: nn.Module) -> dict[str, Tensor]:

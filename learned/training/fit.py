@@ -65,7 +65,7 @@ class Fit:
     @cached_property
     def model(self) -> Gain:
         """The net with the weights that validated best."""
-        return unflatten(self.best.weights[None], self.like)[0]
+        return unflatten(self.best.weights, self.like)
 
     @property
     def best(self) -> Progress:
