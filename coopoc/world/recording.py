@@ -237,6 +237,11 @@ class Recording:
         return drop_steep_azimuths(self.relative)
 
     @cached_property
+    def complete(self) -> bool:
+        """Whether every vehicle has a fix wherever it is."""
+        return bool((np.isfinite(self.gnss) | np.isnan(self.velocity)).all())
+
+    @cached_property
     def _observing(self) -> frozenset[int]:
         return frozenset(self.observers)
 
