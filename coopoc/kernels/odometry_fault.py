@@ -193,7 +193,8 @@ def correct_drives(
         variance: (N, 3) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
-        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2.
+        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
+            length only to ask.
     """
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)
     fails = False
@@ -213,6 +214,7 @@ def correct_drives(
                 r = 0.5 * (variance[n, 0] + variance[n, 1])
                 extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
-                out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
-                out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
+                if len(out):
+                    out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
+                    out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
     return fails
