@@ -71,6 +71,7 @@ ADVICE = {
     "relative measurements while": "A vehicle is there from its first fix on. Clocks: clock=; gaps: max_gap=.",
     HOLDS: "A receiver that has lost its satellites may send the last fix on.",
     "fixes beside": "A shorter dt= uses them.",
+    "speeds without a heading": "Behind a gap of yaw rates a direction is unknown until fixes show it anew.",
     "relative measurements beside": "A shorter dt= uses them.",
 }
 """How to use what was left out, by the beginning of the reason."""

@@ -157,7 +157,8 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
                 pairs.append((last, k))
                 last = k
         if len(pairs) >= 3:
-            return np.diff(numbers[:, np.array(pairs)], axis=2)[..., 0]
+            a, b = np.array(pairs).T
+            return np.asarray(numbers[:, b] - numbers[:, a])
     return np.empty((5, 0))
 
 

@@ -28,8 +28,8 @@ SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
 """m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
-MANY = 10
-"""Fixes of a vehicle that show where it is."""
+MANY, LEAPS = 10, 10.0
+"""Fixes of a vehicle that show where it is; times its usual speed, to and from a fix that is none."""
 SELDOM = 0.02
 """Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
 ALIKE = 0.1
@@ -128,14 +128,19 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
 
 
 def _nowhere(rows: Rows) -> Bools:
-    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 far from all others of the vehicle."""
+    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where others of the vehicle are
+    too far away for its speed."""
     key, some = ["t", "vehicle"], only(rows, "latitude", "longitude", "x", "y")
     zero = some[some["value"] == 0.0].drop_duplicates([*key, "kind"])
     zero = zero[zero.duplicated(key, keep=False)]
-    others = some[~some.set_index(key).index.isin(zero.set_index(key).index)]
-    ends = others.groupby(["vehicle", "kind"])["value"].agg(["min", "max", "size"])
-    least = np.maximum(ends["min"], -ends["max"])
-    away = ends.index[(least > ends["max"] - ends["min"]) & (ends["size"] >= MANY)].get_level_values("vehicle")
+    fixes = some.drop_duplicates([*key, "kind"]).pivot(index=key[::-1], columns="kind", values="value")
+    fixes, at_zero = fixes.reset_index("t"), fixes.index.isin(zero.set_index(key[::-1]).index)
+    moves = fixes.groupby("vehicle").diff()
+    pace = pd.Series(np.hypot(*moves.reindex(columns=["x", "y"]).to_numpy().T) / moves["t"].to_numpy(), fixes.index)
+    leap = at_zero != pd.Series(at_zero, fixes.index).groupby("vehicle").shift(fill_value=False).to_numpy()
+    usual = pace[~at_zero & ~leap].groupby("vehicle").agg(["size", lambda each: each.quantile(0.8)])
+    least = pace[leap].groupby("vehicle").min().reindex(usual.index)
+    away = usual.index[(least > LEAPS * usual.iloc[:, 1]) & (usual["size"] >= MANY)]
     zero = zero[zero["kind"].isin(ENU) | zero["vehicle"].isin(away)]
     at = rows.set_index(key).index.isin(zero.set_index(key).index)
     return np.asarray(at & in_group(rows, "fix"))

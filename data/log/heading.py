@@ -83,10 +83,12 @@ class Reckoning(NamedTuple):
             inside = (signal.t > since) & (signal.t <= until)
             return Signal(signal.t[inside], signal.value[inside])
 
-        parts = [
-            Reckoning(*(within(signal, *span) for signal in self[:3]), self.std) for span in itertools.pairwise(ends)
-        ]
-        return [part for part in parts if min(len(signal.t) for signal in part[:3]) > 1]
+        fixes, speed, rate = (
+            [within(signal, *span) for span in itertools.pairwise(ends)]
+            for signal in (self.fixes, self.speed, self.yaw_rate)
+        )
+        parts = [Reckoning(*each, self.std) for each in zip(fixes, speed, rate, strict=True)]
+        return [part for part in parts if min(len(part.fixes.t), len(part.speed.t), len(part.yaw_rate.t)) > 1]
 
     def far_apart(self) -> Iterator[tuple[int, int, complex, complex]]:
         """Indices of fixes that are BASELINE standard deviations apart, and x + iy m by which they and dead reckoning

@@ -165,9 +165,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
             rate.
     """
     grid, summary, body = steps.grid, steps.summary, steps.body
-    fixes = samples(rows, ("x", "y", "z"), summary, 2 if steps.planar else 3)
-    if steps.planar:
+    flat = steps.planar or not rows["kind"].eq("z").any()
+    fixes = samples(rows, ("x", "y", "z"), summary, 2 if flat else 3)
+    if flat:
         fixes.value[:, 2] = 0.0
+    if flat and not steps.planar:
+        summary.assume("heights of {} are 0: none were logged, or few", name)
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
     still: Floats = np.zeros((len(grid), 3))
@@ -220,7 +223,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     there, by_fixes = _present(signals, steps), signals[0] is fixes
     held = _held(fixes, np.nan_to_num(moves), there, steps, again, way.std)
     if held.any():
-        summary.refuse(HOLDS, only(rows, "x")[lambda rows: rows["t"].isin(fixes.t[held])])
+        own = only(rows, "x")
+        summary.refuse(HOLDS, own[own["t"].isin(fixes.t[held])])
         fixes = Signal(*(values[~held] for values in fixes))
         if by_fixes:
             shown, signals = velocity_of_fixes(way._replace(fixes=fixes), steps), [fixes]
@@ -240,7 +244,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
     alone = heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2)
     velocity = velocity + absent[:, None]
-    climbs = 0.0 if steps.planar or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
+    climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate, compass, moves, alone, climbs)
 

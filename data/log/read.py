@@ -228,6 +228,12 @@ def read_log(
     ids = _ids(rows, body, summary)
     carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
+    count = (
+        rows.groupby("vehicle")["kind"].value_counts().unstack(fill_value=0).reindex(columns=["x", "z"], fill_value=0)
+    )
+    few = rows["vehicle"].isin(count.index[2 * count["z"] < count["x"]]) & (rows["kind"] == "z")
+    summary.refuse("heights of vehicles with few", rows[few])
+    rows = rows[~few]
     grid = _grid(rows, dt, body, summary)
     steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary)
     arms = antenna if isinstance(antenna, Mapping) else dict.fromkeys(ids, antenna)
@@ -237,7 +243,7 @@ def read_log(
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     fleet = None
     if len(true_rows):
-        true_rows = local(true_rows, origin, summary)[0]
+        true_rows = local(true_rows, origin, Summary())[0]
         true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
         fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem, summary)
         for name, share in zip(ids, np.isfinite(fleet.position[..., 0]).mean(axis=0), strict=True):
@@ -473,7 +479,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
     axes = 3 if (rows["kind"] == "z").any() else 2
     heights = pd.DataFrame(recording.gnss[0, ..., 2])
     heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")
-    if axes == 2 and heights.abs().max(axis=None) > 0.0:
+    if axes == 2 and heights.abs().gt(0.0).to_numpy().any():
         summary.assume("the truth has no heights: means of the fixes' over 20 s stand for them, and for their errors")
     poses = np.full((len(steps), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):

@@ -124,14 +124,15 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     codes = own[wrong & ~kind.isin(kind[near])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
-    for name in ("range", "speed", "speed_kmh"):
-        values = own[(kind == name) & ~own.index.isin(lost.index)]
+    for name in ("range", "speed", "speed_kmh", "z", "height"):
+        values = rows[(rows["kind"] == name) & ~rows.index.isin(lost.index)]
         values = values.sort_values(["vehicle", "partner", "t"], kind="stable")
-        usual = values["value"].mode()[:1] if name == "range" else ()  # a car may stand, often
-        for number in {*usual, values["value"].max()}:
+        each = values["value"]  # a car may stand often, and most of what is read stands at one height
+        numbers = [each.min()] if name in ("z", "height") else [*each.mode()[:1]] if name == "range" else []
+        for number in {*numbers, each.max()}:
             lost = pd.concat([lost, values[_leaps(values, number)]])
-    for (name, number), same in lost.groupby(["kind", "value"]):
-        summary.refuse(f"{name} of {number:g}, which stands for none", same)
+    for (what, number), same in lost.groupby(["kind", "value"]):
+        summary.refuse(f"{what} of {number:g}, which stands for none", same)
     return rows.drop(lost.index.unique())
 
 
