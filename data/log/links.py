@@ -153,10 +153,10 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     std = stated_std(fixes, "x", "y")
     moved, vague = _to_step(table, members, steps, APART * (std if std > 0.0 else Sensors().gnss_std[0]))
     summary.refuse("relative measurements off the steps, of what is too near", table[vague])
-    table = table.assign(value=moved).loc[~vague, [*PAIR, "component", "value"]]
-    for word, number in zip(words, np.bincount(table["component"], minlength=3).tolist(), strict=True):
+    kept: pd.DataFrame = table.assign(value=moved).loc[~vague, [*PAIR, "component", "value"]]
+    for word, number in zip(words, np.bincount(kept["component"], minlength=3).tolist(), strict=True):
         summary.count(word, number)
-    return table
+    return kept
 
 
 def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[pd.DataFrame, Bools]:
