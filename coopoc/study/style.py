@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..world.pictures import COLORS
+from ..evaluate.pictures import COLORS
 
 
 @dataclass(frozen=True)

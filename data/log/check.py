@@ -59,6 +59,8 @@ CONFIDENT = 3.0
 """Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
 UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
+DIVERGED = 0.3
+"""Share of its speeds that no odometry errs by, so that a filter that estimates it has diverged."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of what is left out as it should be."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
@@ -200,6 +202,7 @@ def _of_rows(c: Check) -> list[str]:
             + f". {hint}".rstrip(" ")
         )
     mirrored = summary.assumed.get(CLOCKWISE, ())
+    sentences += [f"{sentence}." for sentence in summary.sentences if sentence.startswith("stamps of")]
     return [*sentences, *filter(None, [CLOCKWISE.format(", ".join(mirrored)) * bool(mirrored), summary.unread])]
 
 
@@ -207,7 +210,7 @@ def _of_errors(c: Check) -> list[str]:
     """Vehicles whose filter errs by more than it states."""
     return [
         f"{row['vehicle']}: its filter errs by {row['error_per_std']:.1f} times what it states in the tenth of the "
-        f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what is named below, or by "
+        f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what other lines name, or by "
         "noise that is not as stated."
         for row in sorted(c.vehicles, key=lambda row: -(row.get("error_per_std") or 0.0))
         if (row.get("error_per_std") or 0.0) > CONFIDENT
@@ -260,6 +263,12 @@ def _of_vehicles(c: Check) -> list[str]:
         if distance is not None and not 0.8 <= distance <= 1.25:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
             sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
+        elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
+            sentences.append(
+                f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "
+                "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
+            )
+            continue
         elif row.get("speed_excess") is not None and _beyond(row, "speed_excess", SCALE):
             word = "fast" if row["speed_excess"] > 0 else "slow"
             sentences.append(

@@ -19,11 +19,12 @@ from .units import ANGLES, KINDS, Rows, Summary, in_group, only, place, stated_s
 if TYPE_CHECKING:
     from .motion import Member
 
+UNSTATED = "standard deviations of {}: none was logged"
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
-PERIODS = (86400.0, 604800.0)
-"""s, of clocks: a day, a GPS week."""
+PERIODS, HOUR = (86400.0, 604800.0), 3600.0
+"""s, of clocks: a day, a GPS week; and by which local time leaps."""
 SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
@@ -54,8 +55,12 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
     if 0 < back.mean() < SELDOM:
         who = ", ".join(rows["vehicle"][back].unique())
         summary.assume(
-            f"stamps of {who} go back (first: {place(rows[back])}); rows are in order of stamps: was a clock set?"
+            f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set; rows are in their order"
         )
+    t = np.unique(rows["t"].dropna())
+    leap = np.flatnonzero(np.abs(np.diff(t) - HOUR) < HOUR / 60)
+    if len(leap) == 1:
+        summary.assume(f"stamps of all leap by an hour from {t[leap[0]]:.10g} s on, as local time does: give UTC")
     return rows
 
 
@@ -168,7 +173,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         if stated > 0.0:
             return stated
         if used & set(names):
-            summary.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
+            summary.assume(UNSTATED, f"{default:.3g} {unit} ({names[0]})")
         return default
 
     x, y, z = base.gnss_std

@@ -9,6 +9,7 @@ from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
 from .estimates import ENOUGH, FAR, OUTLYING, SURELY, by_pair, offsets
+from .frames import UNSTATED
 from .motion import MOVING
 from .residuals import Check, plane
 
@@ -140,9 +141,11 @@ def of_measurements(c: Check) -> list[str]:
             )
         if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
             size, std_of = ("less", max(noise, EXACT * least)) if noise < least else ("more", noise)
+            unstated = name in "".join(c.log.summary.assumed.get(UNSTATED, ()))
+            known, hint = ("assumed", "") if unstated else ("stated", " Were variances given as deviations?")
             sentences.append(
-                f"{word}s scatter {size} than stated, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
-                f"stated: std={word}:{std_of:.2g}. Were variances given as deviations?"
+                f"{word}s scatter {size} than {known}, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
+                f"{known}: std={word}:{std_of:.2g}.{hint}"
             )
     return sentences
 
