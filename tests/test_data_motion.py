@@ -1,6 +1,7 @@
 """Logs that hold less than motion: no odometry, no heading, gaps, two rates. References are filterpy's filter of a
 constant velocity with the density that is best by the truth, and filters that are told what a log does not hold."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -199,3 +200,86 @@ def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter()):
         far = np.linalg.norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)
         assert (far[4:] < 2.6).all()
+
+
+NONE = {
+    "heights": lambda rows, part: rows.assign(z=rows["z"].mask(part & rows["z"].notna(), -9999.0)),
+    "places": lambda rows, part: rows.assign(**{k: rows[k].mask(part & rows[k].notna(), 0.0) for k in "xy"}),
+    "deviations": lambda rows, part: rows.assign(x_std=rows["x_std"].mask(part & rows["x_std"].notna(), 9999.0)),
+    "speeds": lambda rows, part: rows.assign(speed=rows["speed"].mask(part, 255.0)),
+}
+
+
+@pytest.mark.parametrize("what", NONE)
+def test_numbers_that_stand_for_none_are_none(tmp_path, what):
+    speed, course = car()
+    log(tmp_path, "car", 1.0, 10, speed=speed, heading=course)
+    rows = pd.read_csv(tmp_path / "a.csv")
+    NONE[what](rows, rows["t"].between(100, 114)).to_csv(tmp_path / "a.csv", index=False)
+    read = co.read_log(tmp_path)
+    assert np.nanmax(np.abs(read.recording.gnss[0] - read.truth.position)) < 6.0
+    assert np.nanmax(np.abs(read.recording.velocity)) < 20.0
+    assert read.recording.sensors.fix_std[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_fixes_that_are_held_are_a_gap_where_nothing_else_moves(tmp_path, held):
+    """With speeds and yaw rates it is one of these, behind which the heading begins anew."""
+    speed, course = car()
+    more = {} if held else {"speed": speed, "yaw_rate": np.gradient(course, 0.1)}
+    log(tmp_path, "car", 1.0, 10, **more)
+    rows = pd.read_csv(tmp_path / "a.csv")
+    part = rows["t"].between(120, 150)
+    columns = ["x", "y", "z"] if held else ["yaw_rate"]
+    rows.loc[part, columns] = rows.loc[~part & rows["t"].lt(120), columns].iloc[-1].to_numpy() if held else np.nan
+    rows.to_csv(tmp_path / "a.csv", index=False)
+    read = co.read_log(tmp_path)
+    assert np.isnan(read.recording.velocity[0, :, 0, 0])[np.searchsorted(read.recording.t, [130.0, 140.0])].all()
+    assert error(read, co.Kalman()) < 2.0
+
+
+@pytest.mark.parametrize("every", [1, 20])
+def test_a_truth_may_be_seldom_and_without_heights(tmp_path, every):
+    u = np.gradient(path("hill"), 0.1, axis=0)
+    read, *_ = log(tmp_path, "hill", 1.0, 10, vx=u[:, 0], vy=u[:, 1], vz=u[:, 2])
+    pd.read_csv(tmp_path / "truth.csv").drop(columns="z")[::every].to_csv(tmp_path / "truth.csv", index=False)
+    assert error(co.read_log(tmp_path), co.Kalman()) < 1.5 * error(read, co.Kalman()) + 0.3
+
+
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        ("smoothed", r"a: its fixes are [01]\.\d+ \+- 0\.0\d s behind its odometry"),
+        ("wind", r"a: it moves by 1\.[4-6]\d \+- 0\.\d+ m/s towards -?\d deg"),
+        ("down", "a: heights of fixes fall where vz is positive"),
+        ("an hour", "stamps of all leap by an hour"),
+    ],
+)
+def test_what_a_log_holds_beside_its_odometry_is_named(tmp_path, fault, named):
+    u = np.gradient(path("drone"), 0.1, axis=0)
+    log(
+        tmp_path,
+        "drone",
+        0.05,
+        2,
+        vx=u[:, 0] - 1.5 * (fault == "wind"),
+        vy=u[:, 1],
+        vz=u[:, 2] * (1 - 2 * (fault == "down")),
+    )
+    (tmp_path / "truth.csv").unlink()
+    rows = pd.read_csv(tmp_path / "a.csv")
+    if fault == "smoothed":
+        rows[[*"xyz"]] = rows[[*"xyz"]].interpolate().ewm(com=8).mean().where(rows[[*"xyz"]].notna())
+    rows["t"] += 3600.0 * ((rows["t"] > 90) & (fault == "an hour"))
+    rows.to_csv(tmp_path / "a.csv", index=False)
+    warnings = check(co.read_log(tmp_path)).warnings
+    assert re.search(named, "\n".join(warnings))
+    assert not re.search("too (fast|slow)|is turned by", "\n".join(warnings))
+
+
+def test_a_robot_without_heights_is_read_beside_a_drone(tmp_path):
+    log(tmp_path, "drone", 0.1, 2)
+    pd.read_csv(tmp_path / "a.csv").drop(columns=["z", "z_std"]).assign(vehicle="b").to_csv(tmp_path / "b.csv")
+    read = co.read_log(tmp_path)
+    assert np.isfinite(read.recording.gnss[0, ::2]).all()
+    assert np.ptp(read.recording.gnss[0, ::2, :, 2], axis=0)[1] == 0.0

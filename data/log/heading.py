@@ -1,6 +1,5 @@
 """Headings of a member of a log: as they were measured, or by its course, or by gyro, odometer and fixes."""
 
-import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -74,21 +73,16 @@ class Reckoning(NamedTuple):
         way = Signal(self.speed.t, self.speed.value * np.column_stack([np.cos(angle), np.sin(angle)]))
         return integral(way, self.fixes.t) @ [1, 1j], self.fixes.value[:, :2] @ [1, 1j]
 
-    def parts(self, gap: float) -> "list[Reckoning]":
+    def parts(self, gap: float) -> "Iterator[Reckoning]":
         """Between gaps of the yaw rate, which nothing leads across."""
-        t = self.yaw_rate.t
-        ends = np.concatenate([[-np.inf], (t[:-1] + 0.5 * gap)[np.diff(t) > gap + SAME], [t[-1] + 0.5 * gap]])
-
-        def within(signal: Signal, since: float, until: float) -> Signal:
-            inside = (signal.t > since) & (signal.t <= until)
-            return Signal(signal.t[inside], signal.value[inside])
-
-        fixes, speed, rate = (
-            [within(signal, *span) for span in itertools.pairwise(ends)]
-            for signal in (self.fixes, self.speed, self.yaw_rate)
-        )
-        parts = [Reckoning(*each, self.std) for each in zip(fixes, speed, rate, strict=True)]
-        return [part for part in parts if min(len(part.fixes.t), len(part.speed.t), len(part.yaw_rate.t)) > 1]
+        for t in np.split(self.yaw_rate.t, np.flatnonzero(np.diff(self.yaw_rate.t) > gap + SAME) + 1):
+            fixes, speed, rate = (
+                Signal(signal.t[inside], signal.value[inside])
+                for signal in (self.fixes, self.speed, self.yaw_rate)
+                for inside in [(signal.t >= t[0] - 0.5 * gap) & (signal.t <= t[-1] + 0.5 * gap)]
+            )
+            if min(len(fixes.t), len(speed.t), len(rate.t)) > 1:
+                yield Reckoning(fixes, speed, rate, self.std)
 
     def far_apart(self) -> Iterator[tuple[int, int, complex, complex]]:
         """Indices of fixes that are BASELINE standard deviations apart, and x + iy m by which they and dead reckoning
