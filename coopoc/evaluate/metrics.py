@@ -318,7 +318,7 @@ def aligned(estimate: Floats, truth: Floats) -> Floats:
     """Positions (T, d) m after the motion of SE(d), d = 2 or 3, that brings them nearest to the truth (Kabsch's).
 
     >>> x = np.array([[0.0, 0], [1, 0], [2, 1]])
-    >>> aligned(x[:, ::-1] * [-1, 1] + 5.0, x).round(9).tolist()
+    >>> (aligned(x[:, ::-1] * [-1, 1] + 5.0, x).round(9) + 0.0).tolist()
     [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]
     """
     x, y = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)

@@ -61,6 +61,8 @@ UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
 DIVERGED = 0.3
 """Share of its speeds that no odometry errs by, so that a filter that estimates it has diverged."""
+USED = "fixes", "relative measurements", "edges", "messages"
+"""Words for what is counted where it is used, as odometry and headings are not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of what is left out as it should be."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
@@ -190,7 +192,10 @@ def _of_rows(c: Check) -> list[str]:
     """Measurements and columns that were left out."""
     summary, sentences = c.log.summary, []
     left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith(EXPECTED)}
-    share = sum(left.values()) / max(summary.rows, 1)
+    used = [number for why, number in left.items() if any(word in why for word in USED)]
+    share = max(
+        sum(used) / max(sum(used) + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or np.inf)
+    )
     held = left.get(HOLDS, 0) > FEW
     if share > UNUSED or held:
         why = HOLDS if held else max(left, key=lambda reason: left[reason])

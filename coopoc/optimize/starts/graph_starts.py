@@ -248,6 +248,8 @@ def unwound(graph: Graph, x: Floats) -> bool:
     if len(graph.ranges) or len(graph.relative_point) or len(graph.pose_prior) > 1:
         return False
     edges = graph.relative_pose
+    if not len(edges):
+        return True
     (i, j), turned = edges.nodes.T, Space(graph.dimension, has_rotation=True).rotation(x)
     error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
     if graph.dimension == 3:
