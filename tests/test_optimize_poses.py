@@ -58,7 +58,7 @@ def _relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
 
 
 def free(problem: Problem) -> np.ndarray:
-    return np.ones((len(problem.names), problem.space.dof)) if problem.movable is None else problem.movable
+    return problem.movable
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])

@@ -271,5 +271,5 @@ def test_a_point_among_poses_has_no_rotation_to_move(poses):
     x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
     problem = Problem("abc", x0=x0, dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)
-    free = np.ones((3, problem.space.dof)) if problem.movable is None else problem.movable
+    free = problem.movable
     assert free.sum(axis=1).tolist() == wanted.tolist()

@@ -105,4 +105,4 @@ def test_bounds_that_push_are_no_local_minimum():
 
 
 def test_what_is_said_of_many_lines_is_said_once():
-    assert _counted([f"line {k}: repaired" for k in range(5021)]) == ("5021 times, first in line 0: repaired",)
+    assert _counted([f"line {k}: repaired" for k in range(5021)]) == ["5021 times, first in line 0: repaired"]

@@ -7,7 +7,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
-from ..arrays import Floats, number
+from ..arrays import TINY, Floats, number
 from ..errors import InputError, require, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
@@ -105,31 +105,21 @@ class Backend:
         Raises:
             InputError: an unknown option, or a problem beyond the capabilities; it names the backends that can.
         """
-        allowed = _options(self.prepare)
         for name in options:
+            allowed = list(inspect.signature(self.prepare).parameters)[1:]
             if name not in allowed:
                 hint = suggestion(name, allowed, "Leave it out.")
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
-        check_limits(**options)
+        most, tolerance = options.get("max_iterations", MAX_ITERATIONS), options.get("tolerance", TOLERANCE)
+        number("max_iterations", most, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
+        number("tolerance", tolerance, TINY, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"
             raise InputError("problem", f"with {', '.join(lacking)}", allowed_, "Name one that can, or change it.")
-        if problem.movable is not None and not problem.movable.any():
+        if not problem.movable.any():
             return lambda part, x: SolverResult(x, 0)
         return self.prepare(problem, **options)
-
-
-def check_limits(max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, **_: Any) -> None:
-    """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
-    number("max_iterations", max_iterations, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
-    number("tolerance", tolerance, 5e-324, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
-
-
-@lru_cache(maxsize=64)
-def _options(prepare: Any) -> list[str]:
-    """Names of what `prepare` takes besides the problem."""
-    return list(inspect.signature(prepare).parameters)[1:]
 
 
 def backends() -> dict[str, Backend]:
@@ -149,7 +139,7 @@ def require_backend(backend: str | Backend) -> Backend:
         MissingLibraryError: its library is not installed; carries the line that installs it.
     """
     if isinstance(backend, str):
-        backend = _checked(backend) if ".py" in backend else _registered(backend)  # a file may change
+        backend = (_registered.__wrapped__ if ".py" in backend else _registered)(backend)  # a file may change
     elif not isinstance(backend, Backend):
         raise unknown("backend", backend, backends())
     if backend.library is not None:
@@ -159,11 +149,7 @@ def require_backend(backend: str | Backend) -> Backend:
 
 @lru_cache(maxsize=64)
 def _registered(name: str) -> Backend:
-    """The backend of an entry point; kept, since reading the entry points takes longer than a small solve."""
-    return _checked(name)
-
-
-def _checked(name: str) -> Backend:
+    """The backend of a name; kept, since reading the entry points takes longer than a small solve."""
     backend = find("coopoc.backends", name)
     if not isinstance(backend, Backend):
         hint = "Give coopoc.Backend(name, prepare, purpose)."

@@ -21,6 +21,7 @@ from .starts.graph_starts import (
     chained,
     contenders,
     incremental_start,
+    loose_firsts,
     parts,
     position_variance,
     rotation_variance,
@@ -89,23 +90,21 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     start_x = _x0(graph, poses, first)
     problem = Problem(graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
-        notes = (
-            *notes,
+        notes.append(
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
-            "and nothing places one to another",
+            "and nothing places one to another"
         )
     if graph.dimension == 2 and (beyond := int((np.abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
-        notes = *notes, f"relative poses beyond two turns, {beyond} in all: are angles in degrees?"
+        notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
     won = Search(first)
     if start == "auto":
-        starts = {name: partial(_x0, graph, poses, name) for name in contenders(graph)}
-        starts["odometry"] = lambda: start_x
+        starts = {name: partial(_x0, graph, poses, name) for name in contenders(graph)} | {"odometry": lambda: start_x}
         problem, won = _raced(graph, problem, starts, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     if won.start.startswith("file") and not graph.guess:
-        notes = (*notes, "the start is the file's vertices, which may be the truth")
+        notes.append("the start is the file's vertices, which may be the truth")
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
 
 
@@ -117,8 +116,8 @@ def _raced(
     if not graph.guess and np.isfinite(graph.position).all():
         late["file"] = lambda _: (_x0(graph, problem.poses, "file"), 0)
     if problem.poses:
-        assert problem.x0 is not None
-        late |= {"eased": partial(eased, start=problem.x0)} if len(graph.ranges) else {}
+        if len(graph.ranges):
+            late["eased"] = partial(eased, start=np.asarray(problem.x0))
         late["incremental"] = lambda _: incremental_start(graph, problem)
     return race(problem, starts, late, unwound, "incremental" if len(graph.ranges) else "")
 
@@ -145,17 +144,17 @@ def started(problem: Problem) -> Problem:
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
-def _counted(notes: Sequence[str]) -> tuple[str, ...]:
+def _counted(notes: Sequence[str]) -> list[str]:
     """Notes "place: what" with one for all places of which the same is said.
 
     >>> _counted(["line 1: was repaired", "line 2: was repaired"])
-    ('2 times, first in line 1: was repaired',)
+    ['2 times, first in line 1: was repaired']
     """
     first = dict[str, str]()
     for note in notes:
         first.setdefault(note.rpartition(": ")[2], note)
     count = Counter(note.rpartition(": ")[2] for note in notes)
-    return tuple(f"{count[what]} times, first in {note}" if count[what] > 1 else note for what, note in first.items())
+    return [f"{count[what]} times, first in {note}" if count[what] > 1 else note for what, note in first.items()]
 
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
@@ -209,10 +208,11 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         if objective == "geodesic":
             factors.append(Factor(kind, edges.nodes, z, cov=edges.covariance))
             continue
-        std = np.sqrt(position_variance(edges.covariance, d))[:, None].repeat(d, axis=1)
+        variance = [position_variance(edges.covariance, d)]
         if turns:
-            own = np.sqrt(rotation_variance(edges.covariance, d))[:, None].repeat(d * d, axis=1)
-            kind, std = f"{kind}_chordal", np.concatenate([std, own], axis=1)
+            kind = f"{kind}_chordal"
+            variance.append(rotation_variance(edges.covariance, d))
+        std = np.sqrt(variance).repeat([d, d * d][: len(variance)], axis=0).T
         factors.append(Factor(kind, edges.nodes, z, std=std))
     ranges, sigma = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
     apart = ranges.distance > 0
@@ -229,6 +229,5 @@ def _fixed(graph: Graph) -> tuple[int, ...]:
     edges = (graph.relative_pose, graph.relative_point, graph.ranges)
     part = parts(len(graph.names), *(each.nodes for each in edges))
     held = np.concatenate([graph.fixed, graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])
-    free = np.flatnonzero(graph.is_pose & ~np.isin(part, part[held]))
-    first = free[np.unique(part[free], return_index=True)[1]]
+    first = loose_firsts(part, np.flatnonzero(graph.is_pose), held)
     return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())

@@ -1,5 +1,6 @@
 """Live estimation: GTSAM's iSAM2 follows the measurements, and `solve` checks where it has led."""
 
+from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ from ..arrays import Floats, checked, instance, number
 from ..errors import InputError, require
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
 from .model.factor import Factor, fused, stacked, unchecked
-from .model.problem import Problem, indices, no_such_node, points, rows
+from .model.problem import Problem, index_of, indices, points, rows
 from .solution import Solution
 from .solve import solve
 from .starts.initial import initial_guess
@@ -66,13 +67,12 @@ class Incremental:
             turns.append(space.has_rotation and len(vector) > d)
             x[k] = vector if turns[-1] else space.join(vector[None, :d])[0]
         points(space, len(x), "values", x)
-        fresh = {name: first + k for k, name in enumerate(new)}
+        every, fresh = [*self.names, *new], {name: first + k for k, name in enumerate(new)}
+        place = ChainMap(fresh, self._place)
 
         def index(node: Any) -> int:
-            known_index = fresh.get(node, self._place.get(node)) if isinstance(node, str) else node
-            if isinstance(known_index, int | np.integer) and 0 <= known_index < first + len(new):
-                return int(known_index) if known_index >= first else self._index(int(known_index))
-            raise no_such_node(node, [*self.names, *new])
+            known_index = index_of(node, place, every)
+            return known_index if known_index >= first else self._index(known_index)
 
         made = list[Factor]()
         for each in factors:
@@ -81,8 +81,8 @@ class Incremental:
                 at = indices(index, kind, nodes)
                 each = Factor(kind, at, rows(kind, z, len(at)), *std)
             made.append(each)
-        used, late = np.unique(stacked(f.nodes.ravel() for f in made)).tolist(), [*new]
-        names = [self.names[k] if k < first else late[k - first] for k in map(index, used)]
+        used = np.unique(stacked(f.nodes.ravel() for f in made)).tolist()
+        names = [every[index(k)] for k in used]
         late_poses = {first + k for k, turned in enumerate(turns) if turned}
         poses = [k for k, node in enumerate(used) if node in self._poses or node in late_poses]
         local = [unchecked(f, nodes=np.searchsorted(used, f.nodes)) for f in made]
@@ -91,7 +91,7 @@ class Incremental:
         self._step(part, used, first, x, turns)
         self._poses |= late_poses
         self._place.update(fresh)
-        self.names += new
+        self.names = every
         self._factors += made
 
     def _step(self, part: Problem, keys: Sequence[int], first: int, x: Floats, turns: Sequence[bool]) -> None:
@@ -142,12 +142,10 @@ class Incremental:
         return np.asarray(turn @ self.isam.marginalCovariance(k) @ turn.T)
 
     def _index(self, node: str | int) -> int:
-        index = self._place.get(node) if isinstance(node, str) else node
-        if not isinstance(index, int | np.integer) or not 0 <= index < len(self.names):
-            raise no_such_node(node, self.names)
+        index = index_of(node, self._place, self.names)
         if self.lag and not self.isam.getLinearizationPoint().exists(index):
             raise InputError("node", node, f"is forgotten, {self.lag} steps after it was used", "Take a longer lag.")
-        return int(index)
+        return index
 
     @property
     def problem(self) -> Problem:
@@ -164,9 +162,8 @@ class Incremental:
         """
         problem = self.problem
         solution, d = solve(problem, throw=throw, **options), problem.dimension
-        assert problem.x0 is not None
-        off = float(np.linalg.norm(solution.x[:, :d] - problem.x0[:, :d], axis=1).max(initial=0.0))
-        return replace(solution, extras=solution.extras | {"isam2_off": off})
+        off = np.linalg.norm((solution.x - np.asarray(problem.x0))[:, :d], axis=1).max(initial=0.0)
+        return replace(solution, extras=solution.extras | {"isam2_off": float(off)})
 
 
 def incremental(

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints, instance
+from ..arrays import Floats, instance
 from ..errors import InputError, MissingLibraryError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES, sparse
-from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, require_backend
 from .graph_problems import started
-from .model.factor import fused
+from .model.derivatives import linearise
+from .model.factor import as_factor, bounded, fused
 from .model.measurements import CONVERTED
 from .model.problem import Problem
 from .robust.graduated import robust_start
@@ -166,30 +166,21 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
     start, placed = guessed(problem)
     if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
         return start, placed
+    items = *problem.factors, *map(as_factor, problem.constraints)
+    counts = [*(np.array(True) for _ in problem.factors), *map(bounded, problem.constraints)]
     with np.errstate(all="ignore"):
-        linear = problem.linearise(start)
-    for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
-        bad = ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=(1, 2))
+        linear = linearise(problem.space, items, problem.movable, start)
+    for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
+        bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
         if bad.any():
-            raise _without_direction(problem, factor.kind, factor.nodes[np.flatnonzero(bad)[0]])
-    if problem.constraints:
-        with np.errstate(all="ignore"):
-            rows = constraint_rows(problem, start)
-        bad = ~np.isfinite(rows.value + rows.matrix.sum(axis=1))
-        if bad.any():
-            k, row, _ = rows.origin[np.flatnonzero(bad)[0]]
-            raise _without_direction(problem, problem.constraints[k].kind, problem.constraints[k].nodes[row])
+            pair = " and ".join(problem.names[n] for n in item.nodes[bad.argmax()])
+            raise InputError(
+                "x0",
+                f"{pair} coincide or stand above each other",
+                f"leave {item.kind} without a direction",
+                "Give an x0 that keeps them apart.",
+            )
     return start, placed
-
-
-def _without_direction(problem: Problem, kind: str, nodes: Ints) -> InputError:
-    pair = " and ".join(problem.names[n] for n in nodes)
-    return InputError(
-        "x0",
-        f"{pair} coincide or stand above each other",
-        f"leave {kind} without a direction",
-        "Give an x0 that keeps them apart.",
-    )
 
 
 def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:

@@ -64,7 +64,7 @@ class Cholesky:
 
 
 class DenseCholesky:
-    """A = U^T U of small matrices by LAPACK, with the interface of `Cholesky`.
+    """A = U^T U of small matrices, of one row at least, by LAPACK, with the interface of `Cholesky`.
 
     Args:
         indptr: (u + 1,) of the upper triangle, CSC.
@@ -84,8 +84,6 @@ class DenseCholesky:
 
     def factor(self, values: Floats) -> bool:
         """Factor an upper triangle's values; whether it is positive definite."""
-        if not self._size:
-            return True
         matrix = np.zeros(self._size**2)
         matrix[self._place] = values
         self._root, info = self._dpotrf(matrix.reshape(self._size, -1).T, clean=0, overwrite_a=1)
@@ -94,16 +92,14 @@ class DenseCholesky:
     @property
     def pivots(self) -> Floats:
         """(u,) squares of U's diagonal."""
-        return np.square(self._root.diagonal()) if self._size else np.zeros(0)
+        return np.asarray(np.square(self._root.diagonal()))
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        return self._dpotrs(self._root, rhs)[0] if self._size else rhs
+        return np.asarray(self._dpotrs(self._root, rhs)[0])
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
         """A^-1 at pairs of unknowns (K,)."""
-        if not self._size:
-            return np.zeros(len(rows))
         whole = self._dpotri(self._root)[0]
         return np.asarray(whole[np.minimum(rows, columns), np.maximum(rows, columns)])
 
@@ -132,11 +128,11 @@ def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
     return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
 
-def with_still(matrix: Any, added: Floats | Bools | None) -> Any:
+def with_still(matrix: Any, added: Floats | Bools) -> Any:
     """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
     from scipy.sparse import diags_array
 
-    return matrix if added is None else matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
+    return matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
 
 
 def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
@@ -163,7 +159,7 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     order = order[postorder(parent, np.diff(at))]
     parent, at, below = structures(*both_ways, order)
     head = supernodes(parent, at, below, width[order])
-    first = np.concatenate([[0], np.cumsum(width[order])])
+    first = np.append(0, np.cumsum(width[order]))
     top = head[1:] - 1
     of = np.repeat(np.arange(len(top)), at[top + 1] - at[top])
     rows = below[_runs(at[top], at[top + 1] - at[top])]
@@ -174,9 +170,9 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     return Fronts(
         _runs(begin[order], width[order]),
         first[head],
-        np.concatenate([[0], np.cumsum(count)]),
+        np.append(0, np.cumsum(count)),
         _runs(first[rows[sort]], wide),
-        np.concatenate([[0], np.cumsum(columns * (columns + count))]),
+        np.append(0, np.cumsum(columns * (columns + count))),
         np.repeat(np.arange(len(top)), columns),
     )
 

@@ -130,7 +130,7 @@ class Layout:
         if not hasattr(self._local, "cholesky"):
             pattern = self.entries.indptr, self.entries.indices
             group = np.nonzero(self.entries.number >= 0)[0]
-            small = self.entries.size <= DENSE
+            small = 0 < self.entries.size <= DENSE
             self._local.cholesky = DenseCholesky(*pattern) if small else Cholesky(*pattern, group)
         return self._local.cholesky  # type: ignore[no-any-return]
 
@@ -161,8 +161,7 @@ def structure_of(problem: Problem) -> Structure:
         Term(Kind(c.measurement, space), c.nodes.tobytes(), steerable(c, movable).tobytes())
         for c in problem.constraints
     )
-    still = b"" if movable is None else (~movable).tobytes()
-    return Structure(len(problem.names), space, still, tuple(factors), tuple(constraints))
+    return Structure(len(problem.names), space, movable.tobytes(), tuple(factors), tuple(constraints))
 
 
 _small = lru_cache(maxsize=256)(Layout)

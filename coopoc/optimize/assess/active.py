@@ -51,28 +51,21 @@ class Active:
     """The constraints that hold at x: equalities, and the inequalities with a multiplier.
 
     Args:
-        multipliers: (rows,) of `Rows`, the gradient of the cost plus matrix^T multipliers vanishes at a minimum; at a
+        rows: all numbers that are bounded.
+        multipliers: (rows,) of them, the gradient of the cost plus matrix^T multipliers vanishes at a minimum; at a
             lower bound they are <= 0, at an upper one >= 0.
-        constraint_gradient: (n dof,) matrix^T multipliers.
         onto: (n dof,) the least step onto what holds.
         along: (n dof, k) sparse, orthonormal directions in which all that holds stays as it is.
         exact: the same for the equalities alone.
-        violation: the largest of any constraint.
-        violated: which, in words.
+        violated: the constraint that is violated most, in words.
     """
 
+    rows: Rows
     multipliers: Floats
-    constraint_gradient: Floats
     onto: Floats
     along: Any
     exact: Any
-    violation: float
     violated: str
-
-    @property
-    def holds(self) -> bool:
-        """True if any direction is taken away."""
-        return bool(self.along.shape[1] < self.along.shape[0])
 
 
 def constraint_rows(problem: Problem, x: Floats) -> Rows:
@@ -95,13 +88,12 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     not hold. Constraints that share no direction are looked at apart from each other.
     """
     rows = constraint_rows(problem, x)
-    length = np.sqrt(np.asarray(rows.matrix.multiply(rows.matrix).sum(axis=1)).ravel())
+    length = np.sqrt(rows.matrix.power(2).sum(axis=1))
     reach = NEAR * length
     low, high = rows.value - rows.lower <= reach, rows.upper - rows.value <= reach
     equal, touched = rows.lower == rows.upper, np.flatnonzero((low | high) & (length > 0))
     multipliers, onto = np.zeros(len(length)), np.zeros(gradient.size)
-    along: list[tuple[Ints, Floats]] = []
-    exact: list[tuple[Ints, Floats]] = []
+    own_columns, along, exact = list[Ints](), list[Floats](), list[Floats]()
     for members, columns, block in _apart(rows.matrix[touched]):
         own = touched[members]
         unit = block / length[own, None]
@@ -110,12 +102,11 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
         pushes = equal[own] | (of_active != 0)
         gap = (rows.value - np.where(multipliers < 0, rows.lower, rows.upper))[own] / length[own]
         onto[columns], ways = _split(unit[pushes], gap[pushes])
-        along.append((columns, ways))
-        exact.append((columns, _split(unit[equal[own]], gap[equal[own]])[1]))
-    constraint_gradient, worst = rows.matrix.T @ multipliers, int(rows.outside.argmax())
-    violation, violated = float(rows.outside[worst]), _words(problem, rows, worst)
-    ways, fixed = (_directions(gradient.size, blocks) for blocks in (along, exact))
-    return Active(multipliers, constraint_gradient, onto, ways, fixed, violation, violated)
+        own_columns.append(columns)
+        along.append(ways)
+        exact.append(_split(unit[equal[own]], gap[equal[own]])[1])
+    ways, fixed = (_directions(gradient.size, own_columns, blocks) for blocks in (along, exact))
+    return Active(rows, multipliers, onto, ways, fixed, _words(problem, rows))
 
 
 def _apart(matrix: Any) -> Iterator[tuple[Ints, Ints, Floats]]:
@@ -150,18 +141,19 @@ def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:
     return -right[:rank].T @ ((left[:, :rank].T @ gap) / values[:rank]), right[rank:].T
 
 
-def _directions(size: int, blocks: list[tuple[Ints, Floats]]) -> Any:
+def _directions(size: int, columns: list[Ints], blocks: list[Floats]) -> Any:
     """(size, k) sparse: the blocks' directions on their columns, and each coordinate that is in no block."""
     from scipy.sparse import block_diag, eye_array
 
-    own = stacked(columns for columns, _ in blocks)
+    own = stacked(columns)
     rest = np.setdiff1d(np.arange(size), own)
-    whole = block_diag([*(block for _, block in blocks), eye_array(len(rest))], format="csr")
+    whole = block_diag([*blocks, eye_array(len(rest))], format="csr")
     return whole[np.argsort(np.concatenate([own, rest]))].tocsc()
 
 
-def _words(problem: Problem, rows: Rows, worst: int) -> str:
+def _words(problem: Problem, rows: Rows) -> str:
     """Which constraint is violated most, of which nodes, and by how much."""
+    worst = rows.outside.argmax()
     k, row, component = rows.origin[worst].tolist()
     item = problem.constraints[k]
     nodes = " and ".join(problem.names[n] for n in item.nodes[row])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_o
 from ..model.derivatives import linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, unchecked
 from ..model.problem import Problem, several
-from .active import Active, active_at, constraint_rows
+from .active import Active, active_at
 
 if TYPE_CHECKING:
     from ..solution import Solution
@@ -64,7 +65,7 @@ class Assessment:
     @property
     def violation(self) -> float:
         """Largest of a constraint, m, rad or m/s."""
-        return 0.0 if self.active is None else self.active.violation
+        return 0.0 if self.active is None else float(self.active.rows.outside.max())
 
 
 def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
@@ -81,8 +82,8 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     J, shape = problem.jacobian(linear), (len(x), problem.space.dof)
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
     active = active_at(problem, x, gradient.reshape(shape))
-    size = float(np.linalg.norm(gradient + active.constraint_gradient))
-    still = None if problem.movable is None else ~problem.movable
+    size = float(np.linalg.norm(gradient + active.rows.matrix.T @ active.multipliers))
+    still = ~problem.movable
     try:
         cov, dx, sound = _marginals(with_still(J.T @ J, still), gradient, shape, active)
     except np.linalg.LinAlgError:
@@ -90,8 +91,7 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
         unknown = np.full((*shape, shape[1]), np.nan)
         return Assessment(linear.cost, size, unknown, np.nan, _unobservable(problem, J, active), active)
-    if still is not None:
-        cov = cov * ~(still[:, :, None] | still[:, None, :])
+    cov = cov * ~(still[:, :, None] | still[:, None, :])
     return Assessment(linear.cost, size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
 
 
@@ -173,13 +173,13 @@ def _marginals(hessian: Any, gradient: Floats, shape: tuple[int, int], active: A
     exact, onto = active.exact, active.onto
     dx = onto - _within(hessian, active.along)[0](gradient + hessian @ onto)
     solve, own = _within(hessian, exact)
-    cov = np.zeros((shape[0], shape[1], shape[1]))
+    cov = np.zeros((*shape, shape[1]))
     for i, c in np.ndindex(*shape):
         unit = np.zeros(shape)
         unit[i, c] = 1.0
         cov[i, :, c] = solve(unit.ravel()).reshape(shape)[i]
     inflation = own * np.einsum("nii->ni", cov).ravel()
-    moves = np.asarray(exact.multiply(exact).sum(axis=1)).ravel() > 1e-9
+    moves = exact.power(2).sum(axis=1) > 1e-9
     sound = ((own > 1e-13 * own.max(initial=0.0)) & (inflation > 0) & (inflation < INFLATION))[moves].all()
     return cov, dx, bool(sound)
 
@@ -208,17 +208,17 @@ def _unobservable(
 
     ways = eye_array(J.shape[1], format="csc") if active is None else active.exact
     J = (J @ ways).tocsc()
-    length = np.sqrt(np.asarray(J.multiply(J).sum(axis=0)).ravel())
+    length = np.sqrt(J.power(2).sum(axis=0))
     measured = length > 0
     null = _null_rows(J[:, measured], length[measured])
     if bent is None:
         null = null @ ways[:, measured].T
-        moves = np.square(null).sum(axis=0) + np.asarray(ways[:, ~measured].power(2).sum(axis=1)).ravel()
-        moves = moves if problem.movable is None else moves * problem.movable.ravel()
+        moves = np.square(null).sum(axis=0) + ways[:, ~measured].power(2).sum(axis=1)
+        moves = moves * problem.movable.ravel()
     else:
         hessian, scale = bent
-        moving = np.arange(J.shape[1]) if problem.movable is None else np.flatnonzero(problem.movable)
-        lost, curved = ~measured[moving], np.asarray(abs(hessian).sum(axis=0)).ravel() > 0
+        moving = np.flatnonzero(problem.movable)
+        lost, curved = ~measured[moving], abs(hessian).sum(axis=0) > 0
         every = np.zeros((J.shape[1], len(null)))
         every[measured] = null.T / length[measured, None]
         own = np.eye(len(moving))[:, lost & curved] if (lost & curved).any() else np.zeros((len(moving), 0))
@@ -227,7 +227,7 @@ def _unobservable(
         moves = np.zeros(J.shape[1])
         moves[moving] = np.square(basis @ turned[:, np.abs(values) <= SLACK]).sum(axis=1) + (lost & ~curved)
     moves = moves.reshape(len(problem.names), -1).sum(axis=1)
-    return tuple(name for name, m in zip(problem.names, moves, strict=True) if m > 1e-6)
+    return tuple(compress(problem.names, moves > 1e-6))
 
 
 def _null_rows(J: Any, length: Floats) -> Floats:
@@ -303,7 +303,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
     """
     if problem.linear and all(c.measurement.linear for c in problem.constraints):
         return True
-    if not active.holds:
+    if active.along.shape[0] == active.along.shape[1]:  # no direction is taken away
         return newton_decrease(problem.replace_unchecked(constraints=()), x) is not None
     within = active.along.T @ _lagrangian(problem, x, active) @ active.along
     return not within.shape[0] or cholesky_of(within) is not None
@@ -314,7 +314,7 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     move."""
     from scipy.sparse import csr_array
 
-    system, structure, rows = sparse(problem), structure_of(problem), constraint_rows(problem, x).origin
+    system, structure, rows = sparse(problem), structure_of(problem), active.rows.origin
     terms, numbers = list(structure.factors), list(system.numbers)
     for k, (item, term) in enumerate(zip(problem.constraints, structure.constraints, strict=True)):
         own, weight = rows[:, 0] == k, np.zeros(item.lower.shape)
@@ -327,8 +327,7 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     values[entries.diagonal] += SLACK * system.quadratic(x, "gauss-newton")[2][system.entries.diagonal]
     moving = np.flatnonzero(entries.number.ravel() >= 0)
     into = csr_array((np.ones(size), (moving, np.arange(size))), shape=(entries.number.size, size))
-    still = None if problem.movable is None else ~problem.movable
-    return with_still(into @ _symmetric(entries, values) @ into.T, still)
+    return with_still(into @ _symmetric(entries, values) @ into.T, ~problem.movable)
 
 
 def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple[str, ...]]:
@@ -346,16 +345,18 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
         what = lost if np.isnan(truth.covariance).all() else "whose covariance is that of the exact Hessian"
         notes.append(f"J^T J is singular at this minimum, {what}")
     if truth.active is not None:
-        free, along, exact = truth.active.along.shape[0], truth.active.along.shape[1], truth.active.exact.shape[1]
+        (free, along), exact = truth.active.along.shape, truth.active.exact.shape[1]
         unknowns, pushing = unknowns - free + along, exact - along
     for factor in problem.factors:
         if factor.loss is None:
             continue
         square = squared(problem, factor, x)
         beyond = np.asarray(factor.loss.weight(square)) < INLIER_WEIGHT
-        spent, out = spent + 0.5 * float(factor.loss.cost(square[beyond]).sum()), out + factor.size * int(beyond.sum())
-        if beyond.any():
-            rejected.append((f"{factor.loss.name} loss", int(beyond.sum()), len(square), f"measurements {factor.kind}"))
+        count = int(beyond.sum())
+        spent += 0.5 * float(factor.loss.cost(square[beyond]).sum())
+        out += factor.size * count
+        if count:
+            rejected.append((f"{factor.loss.name} loss", count, len(square), f"measurements {factor.kind}"))
     mean, variance = expected(problem, unknowns + out)
     notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
     most, spread = expected(problem, out) if pushing else (mean, variance)

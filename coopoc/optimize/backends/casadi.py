@@ -76,16 +76,12 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     def nlp(method: str) -> NlpSolver:
         return NlpSolver(programme(form, method, int(max_iterations)))
 
-    def best(problem: Problem, numbers: Floats, x: Floats) -> SolverResult:
-        """Of the first method that succeeds, else of the last."""
+    def solver(problem: Problem, x: Floats) -> SolverResult:
         for method in methods:
-            end = _run(form, nlp(method), problem, numbers, x, sides, tolerance)
+            end = _run(form, nlp(method), problem, x, sides, tolerance)
             if end.extras["return_status"] == SUCCESS:
                 break
         return replace(end, extras=end.extras | {"method": method})
-
-    def solver(problem: Problem, x: Floats) -> SolverResult:
-        return best(problem, _numbers(problem, x), x)
 
     return solver
 
@@ -94,7 +90,6 @@ def _run(
     form: Structure,
     nlp: "NlpSolver",
     problem: Problem,
-    numbers: Floats,
     x: Floats,
     sides: tuple[Floats, Floats],
     tolerance: float,
@@ -103,14 +98,14 @@ def _run(
     space, free, count, rounds = form.space, form.movable, 0, 0
     multipliers: Floats = np.zeros(len(sides[0]))
     while rounds < ROUNDS:
-        at, multipliers, iterations, status = nlp(np.zeros(int(free.sum())), numbers, sides, multipliers)
+        here = np.zeros(int(free.sum())), _numbers(problem, x)
+        at, multipliers, iterations, status = nlp(*here, sides, multipliers)
         before, step, count, rounds = x, np.zeros(free.shape), count + iterations, rounds + 1
         step[free] = at
         if np.isfinite(at).all():
             x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
         if not space.has_rotation or status in HOPELESS or np.abs(x - before).max(initial=0.0) <= tolerance:
             break
-        numbers = _numbers(problem, x)
     return SolverResult(x, count, status == HOPELESS[0], {"return_status": status, "rounds": rounds})
 
 

@@ -18,7 +18,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         end = arrive(sparse(problem), x, min(1, max_iterations) if problem.linear else max_iterations, tolerance)
-        return SolverResult(end.x, end.iterations, extras={"newton_steps": end.newton_steps, "record": end.record})
+        return SolverResult(end.x, end.iterations, extras={"record": end.record})
 
     return solver
 

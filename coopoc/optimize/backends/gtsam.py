@@ -96,9 +96,7 @@ def forms(problem: Problem) -> list[Form]:
 def _form(problem: Problem, factor: Factor) -> Form:
     if factor.kind not in FORMS:
         return None
-    kinds = [(POINT,) * factor.nodes.shape[1]]
-    if problem.poses:
-        kinds = sorted(set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist())))
+    kinds = set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist()))
     shared = factor.std is not None and len(factor.std) == 1
     parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
     if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
@@ -150,7 +148,7 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     """GTSAM's chord T_j - T_i Z for the translation, its geodesic for the rotation alone."""
-    chord = None if _coupled(W, d) else _chord(W[:, :d, :d], {0: np.arange(d)}, factor.z, d)
+    chord = None if _coupled(W, d) else _chord(W[:, :d, :d], factor.z, d)
     if chord is None:
         return None
     size, first = (3, 2) if d == 2 else (6, 0)
@@ -165,24 +163,20 @@ def _relative_log(factor: Factor, W: Floats, d: int) -> Form:
     return [Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
 
 
-def _relative_chordal(factor: Factor, W: Floats, d: int) -> Form:
-    columns = {0: np.arange(d), **{1 + k: d + k + d * np.arange(d) for k in range(d)}}
-    return _chord(W, columns, factor.z, d)
-
-
-def _chord(W: Floats, columns: dict[int, Any], z: Floats, d: int) -> Form:
+def _chord(W: Floats, z: Floats, d: int) -> Form:
     """GTSAM's T_j - T_i Z is R_i times our residual, column by column: each must have one std and no correlation.
 
     Args:
-        columns: our residuals of the translation (0) and of each column of the rotation (1 + k).
+        W: of the translation, or of it and the rotation.
         z: (M, ambient) poses.
     """
     information = np.swapaxes(W, -1, -2) @ W
     weight = np.zeros((len(W), (d + 1) ** 2))
     expected = np.zeros_like(information)
-    for column, rows in columns.items():
+    rotation = [d + k + d * np.arange(d) for k in range(W.shape[-1] // d - 1)]  # our residuals of each column
+    for column, rows in enumerate([np.arange(d), *rotation], -1):
         own = information[:, rows[0], rows[0]]
-        weight[:, (d + 1) * ((column - 1) % (d + 1)) + np.arange(d)] = own[:, None]
+        weight[:, (d + 1) * (column % (d + 1)) + np.arange(d)] = own[:, None]
         expected[:, rows, rows] = own[:, None]
     scale = np.sqrt(np.einsum("mii->mi", information))
     if (np.abs(information - expected) > SAME * scale[:, :, None] * scale[:, None, :]).any():
@@ -210,46 +204,39 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     **dict.fromkeys(PLAIN, _plain),
     "bearing": _bearing,
     "body_spherical": _bearing,
-    "relative_position": lambda factor, W, d: _chord(
-        W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d
-    ),
+    "relative_position": lambda factor, W, d: _chord(W, Space(d, has_rotation=True).join(factor.z), d),
     "relative_pose": _relative_pose,
     "relative_pose_log": _relative_log,
-    "relative_pose_chordal": _relative_chordal,
+    "relative_pose_chordal": lambda factor, W, d: _chord(W, factor.z, d),
     "pose": _pose_prior,
 }
 """(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 
 
-class Callbacks:
-    """Residuals and derivatives of factors that GTSAM lacks, for its CustomFactors: all at once at each new point.
+def callbacks(problem: Problem, factors: Sequence[Factor]) -> Callable[[int, int, Sequence[int]], Any]:
+    """Residuals and derivatives of factors that GTSAM lacks, for its CustomFactors, all at once at each new point: a
+    function of a factor's number, a row and its nodes, which gives the error function of a measurement."""
+    import gtsam
 
-    Args:
-        problem: a single one.
-        factors: of it.
-    """
+    space, posed, bare = problem.space, which_turn(problem), [unchecked(factor, loss=None) for factor in factors]
+    at: Any = None
+    linear: Any = None
+    turned: Sequence[Floats] = ()
 
-    def __init__(self, problem: Problem, factors: Sequence[Factor]) -> None:
-        self._space, self._posed = problem.space, which_turn(problem)
-        self._factors = [unchecked(factor, loss=None) for factor in factors]
-        self._at: Any = None
-
-    def of(self, k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
-        """The error function of a measurement."""
-        import gtsam
-
+    def of(k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
         def error(_: Any, found: Any, jacobians: Any) -> Any:
-            if self._at is None or not found.equals(self._at, 0.0):
-                self._at, x = gtsam.Values(found), estimate(self._space, self._posed, found)
-                self._linear = linearise(self._space, self._factors, None, x)
-                self._tangent = tangent(self._space, self._posed, x)
+            nonlocal at, linear, turned
+            if at is None or not found.equals(at, 0.0):
+                at, x = gtsam.Values(found), estimate(space, posed, found)
+                linear, turned = linearise(space, bare, None, x), tangent(space, posed, x)
             if jacobians is not None:
                 for slot, i in enumerate(nodes):
-                    by = self._linear.jacobian[k][slot]
-                    jacobians[slot] = by[row] @ self._tangent[i]
-            return self._linear.residual[k][row]
+                    jacobians[slot] = linear.jacobian[k][slot][row] @ turned[i]
+            return linear.residual[k][row]
 
         return error
+
+    return of
 
 
 def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None = None) -> Any:
@@ -261,25 +248,25 @@ def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None
 
     graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
     lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if form is None]
-    callbacks = Callbacks(problem, lacking)
+    error = callbacks(problem, lacking)
     for k, factor in enumerate(lacking):
         model = _robust(gtsam.noiseModel.Unit.Create(factor.size), factor.loss)
         for row in np.flatnonzero(factor.informative).tolist():
             nodes = factor.nodes[row].tolist()
-            graph.add(gtsam.CustomFactor(model, nodes, callbacks.of(k, row, nodes)))
+            graph.add(gtsam.CustomFactor(model, nodes, error(k, row, nodes)))
     for factor, form in zip(problem.factors, parts, strict=True):
         for part in form or ():
-            models = _models(part.root, factor)
-            for nodes, arguments, model in zip(factor.nodes.tolist(), part.arguments, models, strict=True):
+            roots = np.broadcast_to(part.root, (len(factor.nodes), *part.root.shape[1:]))
+            for nodes, arguments, root in zip(factor.nodes.tolist(), part.arguments, roots, strict=True):
+                model = _model(root.tobytes(), len(root), factor.loss)
                 if tuple([posed[i] for i in nodes]) not in part.names:
                     nodes = nodes[::-1]  # such as a range from a point to a pose
                 made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
                 if model is not None:
                     graph.add(made(*[keys[i] for i in nodes], *arguments, model))
     for i in problem.fixed:
-        assert problem.x0 is not None
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
-        graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, problem.x0[i], posed[i])))
+        graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, np.asarray(problem.x0)[i], posed[i])))
     return graph
 
 
@@ -340,15 +327,10 @@ def _node(d: int, x: Floats, turns: bool) -> Any:
     return pose_of(d, x) if turns else x[:d]
 
 
-def _models(root: Floats, factor: Factor) -> list[Any]:
-    """A noise model per measurement of roots (M or 1, k, k), one object for equal ones; None: it has no information."""
-    size, loss = root.shape[-1], factor.loss
-    return [_model(row.tobytes(), size, loss) for row in root] * (len(factor.nodes) if len(root) == 1 else 1)
-
-
 @lru_cache(maxsize=1024)
 def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
-    """Of one measurement, kept for the next equal ones; what GTSAM itself takes for diagonal may have entries below."""
+    """The noise model of one measurement by its root (size, size), kept for the next equal ones; None: it has no
+    information. What GTSAM itself takes for diagonal may have entries below."""
     import gtsam
 
     noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)

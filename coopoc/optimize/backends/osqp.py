@@ -130,14 +130,7 @@ class Programme:
     """
 
     def __init__(self, pattern: Any, rows: Any) -> None:
-        from scipy.sparse import csr_array
-
         self._pattern, self._rows = pattern, rows
-        row, column = pattern.indices.astype(np.int64), np.repeat(np.arange(rows.shape[1]), np.diff(pattern.indptr))
-        off = np.flatnonzero(row != column)
-        self._entry = np.append(np.arange(len(row)), off)
-        self._column, into = np.append(column, row[off]), np.append(row, column[off])
-        self._into = csr_array((np.ones(len(into)), (into, np.arange(len(into)))), shape=(rows.shape[1], len(into)))
         self._workspace: Any = None
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
@@ -185,7 +178,8 @@ class Programme:
     def _holds(self, values: Floats, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
         own, value = values[self._pattern.indptr[1:] - 1], self._rows @ dx
-        rest = self._into @ (values[self._entry] * dx[self._column]) + q
+        self._pattern.data = values
+        rest = self._pattern @ dx + self._pattern.T @ dx - own * dx + q
         weak = KKT * float(np.maximum(np.abs(q), np.abs(own * dx)).max(initial=0.0))
         if not (np.abs(rest + self._rows.T @ y) <= weak + NEGLIGIBLE * own).all():
             return False

@@ -6,7 +6,7 @@ from ...arrays import Floats, Ints
 from ..algebra.cholesky import cholesky_of, columns_solved
 from ..model.factor import stacked
 from ..model.problem import Problem
-from ..starts.graph_starts import parts
+from ..starts.graph_starts import loose_firsts, parts
 from .qcqp import TERMS, quadratic
 
 TIE = 1e-6
@@ -83,7 +83,5 @@ def chordal_start(problem: Problem) -> Floats:
 def _anchors(problem: Problem) -> Ints:
     """One pose of each part of the problem that nothing joins to the world or, linearly, to another."""
     linear = [factor.nodes for factor in problem.factors if factor.kind in RELAXED]
-    part = parts(len(problem.names), *(n for n in linear if n.shape[1] == 2))
-    held = part[stacked(n[:, 0] for n in linear if n.shape[1] == 1)]
-    poses = np.setdiff1d(problem.poses, np.flatnonzero(np.isin(part, held)))
-    return poses[np.unique(part[poses], return_index=True)[1]]
+    part = parts(len(problem.names), *linear)
+    return loose_firsts(part, np.array(problem.poses, np.int64), stacked(n[:, 0] for n in linear if n.shape[1] == 1))

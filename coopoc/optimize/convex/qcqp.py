@@ -179,11 +179,11 @@ def quadratic(problem: Problem) -> Quadratic:
     position, rotation = problem.space.position(x), np.array(problem.space.rotation(x))
     if not problem.fixed:
         rotation[:] = np.eye(d)
-    A, kept = rows.without_fixed(position - origin, rotation)
+    A = rows.without_fixed(position - origin, rotation)
     poses = np.setdiff1d(rows.poses, problem.fixed)
     top = len(rows.frame) + d * len(poses)
     return Quadratic(
-        rows=A[:, kept],
+        rows=A,
         stiefel=np.arange(top).reshape(-1, len(rows.frame) if uneven else d),
         sphere=top + np.arange(len(edges) * rows.width).reshape(len(edges), rows.width),
         dimension=d,
@@ -245,23 +245,20 @@ class _Rows:
         A.sum_duplicates()
         return A
 
-    def without_fixed(self, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
-        """A with the terms of fixed nodes moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to
-        keep."""
-        from scipy.sparse import csr_array
+    def without_fixed(self, position: Floats, rotation: Floats) -> Any:
+        """A without fixed nodes, whose terms move to the frame: t_i = p_i^T H and R_i^T = R_i^T H."""
+        from scipy.sparse import csr_array, hstack
 
-        A, fixed = self.matrix(), self.fixed
+        A, fixed, size = self.matrix(), self.fixed, len(self.frame)
         if not len(fixed):
-            return A, np.arange(A.shape[1])
+            return A
         at, turned = self.position(fixed), np.intersect1d(fixed, self.poses)
         gone = np.concatenate([at.ravel(), self.rotation(turned).ravel()])
         values = [position[fixed].reshape(at.size, -1)]
         if len(turned):
             values.append(np.swapaxes(rotation[turned], 1, 2).reshape(-1, self.d))
-        size = len(self.frame)
-        frame = csr_array((np.ones(size), (np.arange(size), self.frame)), shape=(size, A.shape[1]))
-        moved = A[:, gone] @ csr_array(np.concatenate(values)) @ frame
-        return csr_array(A + moved), np.setdiff1d(np.arange(A.shape[1]), gone)
+        frame = A[:, :size] + A[:, gone] @ csr_array(np.concatenate(values))
+        return hstack([frame, A[:, np.setdiff1d(np.arange(size, A.shape[1]), gone)]], format="csr")
 
 
 def _position(rows: _Rows, factor: Factor) -> None:

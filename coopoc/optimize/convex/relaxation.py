@@ -98,7 +98,16 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
     block, sphere, Z = semidefinite(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
     bound = reduced.lower_bound(Multipliers(form, block, sphere))[0]
     values, vectors = np.linalg.eigh(Z)
-    return _rounded(problem, reduced, vectors * np.sqrt(np.maximum(values, 0.0)), bound, began, refine)
+    Y, d, space = vectors * np.sqrt(np.maximum(values, 0.0)), form.columns, problem.space
+    _, values, rows = np.linalg.svd(Y, full_matrices=False)
+    gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
+    top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
+    x, solution = space.join(*form.drop(reduced.settle(form.project(top)))), None
+    if refine:  # the refined point's own bound never exceeds Shor's but by what the solver lacks
+        solution = solve(replace(problem, x0=x), throw=False)
+        X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
+        bound = max(bound, reduced.lower_bound(multipliers(form, X, reduced.times(X)))[0])
+    return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
 
 
 @lru_cache(maxsize=64)
@@ -131,24 +140,6 @@ def semidefinite(
         return (block + block.swapaxes(1, 2)) / 2, -scale * np.array([each.dual_value for each in units]), Z.value
 
     return run
-
-
-def _rounded(problem: Problem, reduced: Reduced, Y: Floats, bound: float, began: float, refine: bool) -> Relaxation:
-    """The relaxation Z = Y Y^T put back on the manifolds by the nearest of rank d, and what refining makes of it.
-
-    The refined point's own bound is taken where it is better; it never exceeds Shor's.
-    """
-    form, space = reduced.problem, problem.space
-    _, values, rows = np.linalg.svd(Y, full_matrices=False)
-    d = form.columns
-    gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
-    top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
-    x, solution = space.join(*form.drop(reduced.settle(form.project(top)))), None
-    if refine:
-        solution = solve(replace(problem, x0=x), throw=False)
-        X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
-        bound = max(bound, reduced.lower_bound(multipliers(form, X, reduced.times(X)))[0])
-    return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
 
 
 @dataclass(frozen=True)

@@ -58,14 +58,12 @@ class Arrival:
         converged: the last step was below the tolerance, or its predicted decrease is rounding.
         record: (iterations, 3) the cost before each, its damping, and its gain ratio (NaN where the matrix was not
             positive definite).
-        newton_steps: how many iterations used the exact Hessian.
     """
 
     x: Floats
     iterations: int
     converged: bool
     record: Floats
-    newton_steps: int
 
 
 def arrive(
@@ -90,16 +88,19 @@ def arrive(
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
     """
-    mu, against = 0.0, 0
-    step = step or _factored(system)
+    mu, against, cholesky = 0.0, 0, system.cholesky
+
+    def factored(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
+        return (-cholesky.solve(gradient), 0.0) if cholesky.factor(values) else None
+
+    step = step or factored
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
-    newton, converged, last, still = 0, False, np.inf, 0
+    converged, last, still = False, np.inf, 0
     cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
             counted(cost)
-            newton += model == "newton"
             damping = _marquardt(system, undamped[2], mu, LEAST_INFORMATION if bounded else 1.0)
             whole = values
             if damping is not None:
@@ -147,17 +148,7 @@ def arrive(
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
                 undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
-    return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
-
-
-def _factored(system: Sparse) -> Step:
-    """Steps by Cholesky factors."""
-    cholesky = system.cholesky
-
-    def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
-        return (-cholesky.solve(gradient), 0.0) if cholesky.factor(values) else None
-
-    return step
+    return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3))
 
 
 def _grown(mu: float) -> float:

@@ -78,56 +78,41 @@ class Structure(NamedTuple):
     Attributes:
         nodes: n.
         space: where they live.
-        still: (n, dof) as bytes, True where a node cannot move; empty: all move.
+        moves: `movable` as bytes.
         factors: in the problem's order.
         constraints: as `factors`.
     """
 
     nodes: int
     space: Space
-    still: bytes
+    moves: bytes
     factors: tuple[Term, ...]
     constraints: tuple[Term, ...]
 
     @property
     def movable(self) -> Bools:
         """(n, dof) True where a node can move."""
-        shape = (self.nodes, self.space.dof)
-        return ~np.frombuffer(self.still, bool).reshape(shape) if self.still else np.ones(shape, dtype=bool)
+        return np.frombuffer(self.moves, bool).reshape(self.nodes, self.space.dof)
 
 
 def numbers_of(factor: Factor) -> Floats:
     """(P, M) z, constants and weights of the measurements of a factor."""
     weight = np.asarray(factor.sqrt_information) if factor.std is None else 1.0 / factor.std
     weight = weight.reshape(len(weight), -1)
-    assert factor.constants is not None
-    first, second = factor.z.shape[-1], factor.z.shape[-1] + factor.constants.shape[1]
-    out = np.empty((second + weight.shape[-1], len(factor.nodes)))
-    out[:first], out[first:second], out[second:] = factor.z.T, factor.constants.T, weight.T
-    return out
+    weight = np.broadcast_to(weight, (len(factor.nodes), weight.shape[1]))
+    return np.hstack([factor.z, np.asarray(factor.constants), weight]).T.copy()
 
 
-class Residual(NamedTuple):
-    """The whitened residual of one measurement, by CasADi's symbols.
-
-    Attributes:
-        nodes: (arity ambient,).
-        number: (P,) see `numbers_of`.
-        steps: (arity dof,) of the nodes.
-        white: (size,).
-    """
-
-    nodes: Any
-    number: Any
-    steps: Any
-    white: Any
-
-
-def residual_of(kind: Kind, converted: bool = False) -> Residual:
-    """The whitened residual of one measurement; of converted ones those without a linear form have none.
+def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
+    """The whitened residual (size,) of one measurement by CasADi's symbols of its nodes (arity ambient,), its numbers
+    (P,), see `numbers_of`, and steps (arity dof,) of the nodes. Of converted ones those without a linear form have
+    none.
 
     A step (dp, w) moves a node to (p + dp, R C(w)), C the Cayley map in space, which like Exp starts as I + [w]x but is
     rational, and the angle itself in the plane.
+
+    Returns:
+        the three symbols, and the residual.
 
     Raises:
         InputError: CasADi cannot run the formula.
@@ -144,10 +129,16 @@ def residual_of(kind: Kind, converted: bool = False) -> Residual:
         for k in range(arity)
     ]
     z, assumed, weight = numbers[:z_width], numbers[z_width : z_width + constants], numbers[z_width + constants :]
-    vectors = converted and measurement.name == CONVERTED
+    vectors, m = converted and measurement.name == CONVERTED, _namespace()
     try:
         local = _local(measurement, places)
-        gap = _converted(local, z) if vectors else _wrapped(measurement, local, z, assumed, space.dimension)
+        if vectors:
+            distance, rows = converted_rows(z, m)
+            gap = [sum(a * v for a, v in zip(row, local, strict=True)) for row in rows]
+            gap[0] -= distance
+        else:  # angles in [-pi, pi]: the derivative of the remainder is 1
+            parts = zip(measurement.residual(local, z, assumed, m), measurement.angles(space.dimension), strict=True)
+            gap = [m.remainder(part, 2.0 * np.pi) if angle else part for part, angle in parts]
         size = len(gap)
         if kind.full:
             gap = [sum(weight[size * k + j] * gap[j] for j in range(size)) for k in range(size)]
@@ -161,7 +152,7 @@ def residual_of(kind: Kind, converted: bool = False) -> Residual:
         raise InputError("kind", repr(measurement.name), f"must run on CasADi's numbers: {why}", hint) from problem
     if converted and not (vectors or measurement.linear):
         white = ca.SX(white.numel(), 1)
-    return Residual(nodes, number, steps, white)
+    return [nodes, number, steps], white
 
 
 def robust(square: Any, loss: Loss | None) -> Any:
@@ -183,8 +174,8 @@ def expressions(structure: Structure) -> dict[str, Any]:
 
     def each(term: Term, number: Any) -> list[Any]:
         """The whitened residuals of all measurements of a term, their numbers (M, P)."""
-        residual = residual_of(term.kind)
-        white = ca.Function("white", [residual.nodes, residual.number, residual.steps], [residual.white])
+        symbols, one = residual_of(term.kind)
+        white = ca.Function("white", symbols, [one])
         places = [(ca.vec(centre[nodes, :].T), ca.vec(step[nodes, :].T)) for nodes in term.nodes.tolist()]
         return [white(at, number[k, :].T, moved) for k, (at, moved) in enumerate(places)]
 
@@ -201,22 +192,6 @@ def expressions(structure: Structure) -> dict[str, Any]:
         bounds.append(value[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
     f, g = ca.cse([ca.SX(cost), ca.vertcat(*bounds)])  # a node's turn is that of all its measurements
     return {"x": steps, "p": ca.veccat(centre, *numbers), "f": f, "g": g}
-
-
-def _converted(vector: Numbers, z: Numbers) -> Numbers:
-    d, rows = converted_rows(z, _namespace())
-    along, *across = (sum(a * v for a, v in zip(row, vector, strict=True)) for row in rows)
-    return [along - d, *across]
-
-
-def _wrapped(measurement: Measurement, local: Numbers, z: Numbers, constants: Numbers, dimension: int) -> Numbers:
-    """h - z, angles in [-pi, pi]: the derivative of the remainder is 1."""
-    m = _namespace()
-    parts = measurement.residual(local, z, constants, m)
-    return [
-        m.remainder(part, 2.0 * np.pi) if angle else part
-        for part, angle in zip(parts, measurement.angles(dimension), strict=True)
-    ]
 
 
 @lru_cache(maxsize=1)
@@ -296,7 +271,7 @@ def write(kind: Kind, model: Model) -> Written:
 
     if model == "converted":
         kind = kind._replace(loss=None)
-    nodes, number, steps, white = residual_of(kind, model == "converted")
+    (nodes, number, steps), white = residual_of(kind, model == "converted")
     square = ca.SX.sym("square")
     rho = robust(square, kind.loss)
     cost = ca.sum1(white) if kind.bound else 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
@@ -314,9 +289,8 @@ def write(kind: Kind, model: Model) -> Written:
         entries += [*((i, -1) for i in range(steps.size1())), *upper]
     here = ca.cse(ca.substitute(ca.vertcat(*outputs), steps, ca.SX.zeros(steps.size1())))
     kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
-    together = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
-    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], together), kind.measurement.name)
-    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
+    function = ca.Function("tape", [ca.vertcat(nodes, number)], [ca.densify(here[kept])])
+    return Written(_tape(function, kind.measurement.name), np.array([entries[k] for k in kept], dtype=np.int64))
 
 
 def _tape(function: Any, name: str) -> "Tape":
@@ -380,12 +354,11 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
     for factor in factors:
         residual, jacobian = _evaluated(space, factor, x)
         square = np.square(residual).sum(axis=1)
-        if factor.loss is None:
-            cost += 0.5 * float(square.sum())
-        else:
+        if factor.loss is not None:
             root = np.sqrt(factor.loss.weight(square))[:, None]
             residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)
-            cost += 0.5 * float(factor.loss.cost(square).sum())
+            square = factor.loss.cost(square)
+        cost += 0.5 * float(square.sum())
         if movable is not None:
             jacobian = tuple(s * movable[n][:, None] for s, n in zip(jacobian, factor.nodes.T, strict=True))
         residuals.append(residual)
@@ -419,14 +392,12 @@ def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int,
     """Sparse Jacobian (rows, n dof), CSR; shape is n and dof."""
     from scipy.sparse import csr_array
 
-    (n, dof), top = shape, 0
-    data, rows, columns = list[Floats](), list[Ints](), list[Ints]()
-    for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
-        count, size = residual.shape
-        row = top + np.arange(count * size).reshape(count, size, 1)
-        for nodes, jacobian in zip(factor.nodes.T, jacobians, strict=True):
-            data.append(jacobian.ravel())
-            rows.append(np.broadcast_to(row, (count, size, dof)).ravel())
-            columns.append(np.broadcast_to(dof * nodes[:, None, None] + np.arange(dof), (count, size, dof)).ravel())
-        top += count * size
-    return csr_array((stacked(data), (stacked(rows), stacked(columns))), shape=(top, n * dof))
+    (n, dof), data, columns, lengths = shape, list[Floats](), list[Ints](), list[Ints]()
+    for factor, jacobians in zip(factors, linear.jacobian, strict=True):
+        by_nodes = np.concatenate(jacobians, axis=2)
+        own = (dof * factor.nodes[:, :, None] + np.arange(dof)).reshape(len(by_nodes), 1, -1)
+        data.append(by_nodes.ravel())
+        columns.append(np.broadcast_to(own, by_nodes.shape).ravel())
+        lengths.append(np.full(by_nodes[..., 0].size, own.shape[2]))
+    starts = np.append(0, np.cumsum(stacked(lengths)))
+    return csr_array((stacked(data), stacked(columns), starts), shape=(len(starts) - 1, n * dof))

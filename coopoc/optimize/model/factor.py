@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import InitVar, dataclass, fields
 from functools import cache, cached_property
-from itertools import groupby
 from typing import Any, TypeVar
 
 import numpy as np
@@ -214,18 +213,10 @@ def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
     >>> fused([Factor("position", [[k]], [[0.0, 0, 0]], std=1.0 + k) for k in range(2)])
     (Factor(position x 2),)
     """
-    forms = [_form(factor) for factor in factors]
-    if len(set(forms)) == len(forms):
-        return factors
-    order = sorted(range(len(forms)), key=forms.__getitem__)
-    groups = [list(group) for _, group in groupby(order, key=forms.__getitem__)]
-    groups.sort(key=min)
-    return tuple(_joined([factors[k] for k in group]) for group in groups)
-
-
-def _form(factor: Factor) -> tuple[Any, ...]:
-    loss = ("", 0.0) if factor.loss is None else (factor.loss.name, factor.loss.scale)
-    return factor.kind, *loss, factor.std is None
+    groups = dict[Any, list[Factor]]()
+    for factor in factors:
+        groups.setdefault((factor.kind, factor.loss, factor.std is None), []).append(factor)
+    return factors if len(groups) == len(factors) else tuple(map(_joined, groups.values()))
 
 
 def _joined(factors: list[Factor]) -> Factor:
@@ -281,8 +272,9 @@ class Constraint:
             except ValueError:
                 allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
                 raise InputError(name, side.shape, allowed, "Give one bound per component.") from None
-        if np.isnan(self.lower).any() or np.isnan(self.upper).any() or (self.lower > self.upper).any():
-            bad = np.argwhere(~(self.lower <= self.upper))[0]
+        wrong = ~(self.lower <= self.upper)  # of NaN, too
+        if wrong.any():
+            bad = np.argwhere(wrong)[0]
             bad_row = f"[{self.lower[tuple(bad)]}, {self.upper[tuple(bad)]}] in row {bad[0]}"
             raise InputError(f"bounds of {self.kind}", bad_row, "must have lower <= upper", "No point can satisfy it.")
         if np.isinf(self.lower).all() and np.isinf(self.upper).all():
@@ -315,9 +307,7 @@ def bounded(constraint: Constraint) -> Bools:
     return np.isfinite(constraint.lower) | np.isfinite(constraint.upper)
 
 
-def steerable(constraint: Constraint, movable: Bools | None) -> Bools:
+def steerable(constraint: Constraint, movable: Bools) -> Bools:
     """(M, size) True where a side is finite and a node can move, `movable` (n, dof): the rows that a solver gets."""
-    if movable is None:
-        return bounded(constraint)
     moves = np.asarray(movable[constraint.nodes].any(axis=(1, 2)))
     return bounded(constraint) & moves[:, None]

@@ -63,8 +63,6 @@ def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
 
 def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
     """(M, c) finite numbers, as many as the kind has."""
-    if measurement.constants == 0 and (constants is None or np.size(constants) == 0):
-        return frozen(np.empty((count, 0)))
     values = checked(f"constants of {measurement.name}", [] if constants is None else constants)
     fits = (
         values.ndim in (1, 2)
@@ -81,26 +79,25 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
 
 def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
     """z as (M, k): finite, distances > 0, angles in radians, rotations that are some."""
-    array = checked(f"z of {measurement.name}", z)
+    field = f"z of {measurement.name}"
+    array = checked(field, z)
     if array.ndim != 2 or len(array) != count:
         shape = f"must have shape ({count}, {measurement.width()}) for {measurement.name}"
         raise InputError("z", array.shape, shape, "One row per row of nodes; a problem for each run.")
     dimension = fitting(measurement, array.shape[-1]) or 3
-    if not np.isfinite(array).all():
-        bad = np.argwhere(~np.isfinite(array))[0]
-        hint = "Drop the measurement, or give it std = inf and any finite z."
-        raise InputError(f"z of {measurement.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", hint)
+    hint = "Drop the measurement, or give it std = inf and any finite z."
+    refuse(field, array, ~np.isfinite(array), "must be finite", hint)
     if measurement.compares_poses:
-        check_rotations(f"z of {measurement.name}", Space(dimension, has_rotation=True).rotation(array))
+        check_rotations(field, Space(dimension, has_rotation=True).rotation(array))
         return array
     for column, kept in zip(array.T, measurement.kept(dimension), strict=False):
         component = measurement.components[kept]
-        if component == "distance" and (column <= 0).any():
+        if component == "distance":
             hint = "Coincident vehicles have no direction: drop the pair."
-            raise InputError(f"z of {measurement.name}", column.min(), "must be a distance > 0 m", hint)
-        if component == "angle" and (np.abs(column) > 2 * np.pi).any():
+            refuse(field, column, column <= 0, "must be a distance > 0 m", hint)
+        if component == "angle":
             hint = "This looks like degrees: use np.deg2rad."
-            raise InputError(f"z of {measurement.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
+            refuse(field, column, np.abs(column) > 2 * np.pi, "must be within 2 pi rad", hint)
     return array
 
 

@@ -130,9 +130,8 @@ def measurement(
 
     instance("name", name, str, 'Give the kind of its factors, such as "range".')
     one_of("frame", frame, Frame)
-    if isinstance(arity, bool) or not isinstance(arity, int) or not 1 <= arity <= (9 if frame == "nodes" else 2):
-        hint = 'The formula gets one vector x, y, z; frame="nodes" gives it up to nine nodes.'
-        raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", hint)
+    hint = 'The formula gets one vector x, y, z; frame="nodes" gives it up to nine nodes.'
+    number("arity", arity, 1, 9 if frame == "nodes" else 2, kind=int, allowed="1 (a node) or 2 (a pair)", hint=hint)
     entries = components if isinstance(components, tuple | list) else ()
     if not entries or not all(isinstance(component, str) and component in get_args(Component) for component in entries):
         hint = "Give one per number that the formula returns."
@@ -160,12 +159,11 @@ def lookup(kind: str) -> Measurement:
     Raises:
         InputError: no such kind (lists the kinds and the nearest one), or the object is no measurement.
     """
-    if not isinstance(kind, str):
-        raise unknown("kind", kind, sorted(MEASUREMENTS))
-    if kind in MEASUREMENTS:
+    if isinstance(kind, str) and kind in MEASUREMENTS:
         return MEASUREMENTS[kind]
-    if not in_file(kind) and kind not in names("coopoc.measurements"):
-        raise unknown("kind", kind, sorted({*MEASUREMENTS, *names("coopoc.measurements")}))
+    plugins = names("coopoc.measurements")
+    if not isinstance(kind, str) or not (in_file(kind) or kind in plugins):
+        raise unknown("kind", kind, sorted({*MEASUREMENTS, *plugins}))
     formula = find("coopoc.measurements", kind)
     for registered in MEASUREMENTS.values():
         if registered.formula is formula:

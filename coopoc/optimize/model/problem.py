@@ -1,9 +1,10 @@
 """Problem: nodes and factors between them; whitened residuals, their exact Jacobian and the cost."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import compress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -131,16 +132,11 @@ class Problem:
         return _space(self.dimension, bool(self.poses))
 
     @cached_property
-    def movable(self) -> Bools | None:
-        """(n, dof) False where a node cannot move: it is fixed, or a point that has no rotation. None: all are free."""
-        space, n = self.space, len(self.names)
-        if not self.fixed and len(self.poses) in (0, n):
-            return None
-        movable = np.ones((n, space.dof), dtype=bool)
-        if space.has_rotation:
-            turnless = np.ones(n, dtype=bool)
-            turnless[list(self.poses)] = False
-            movable[turnless, space.dimension :] = False
+    def movable(self) -> Bools:
+        """(n, dof) False where a node cannot move: it is fixed, or a point that has no rotation."""
+        movable = np.ones((len(self.names), self.space.dof), dtype=bool)
+        if self.poses:
+            movable[np.setdiff1d(np.arange(len(movable)), self.poses), self.dimension :] = False
         movable[list(self.fixed)] = False
         return movable
 
@@ -159,11 +155,7 @@ class Problem:
 
     def index(self, node: str | int) -> int:
         """Index of a node given by name or index; InputError if there is none."""
-        if isinstance(node, str) and node in self._place:
-            return self._place[node]
-        if isinstance(node, int | np.integer) and 0 <= node < len(self.names):
-            return int(node)
-        raise no_such_node(node, self.names)
+        return index_of(node, self._place, self.names)
 
     def add(
         self,
@@ -212,11 +204,9 @@ class Problem:
         (Constraint(-inf <= position <= inf x 1),)
         """
         index = indices(self.index, kind, nodes)
-        size = lookup(kind).size(self.dimension)
-        low, high = (
-            np.broadcast_to(limit, (len(index), size)) if limit.ndim == 0 else limit
-            for limit in (checked("lower", lower), checked("upper", upper))
-        )
+        shape = len(index), lookup(kind).size(self.dimension)
+        limits = checked("lower", lower), checked("upper", upper)
+        low, high = (limit if limit.ndim else np.broadcast_to(limit, shape) for limit in limits)
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
 
@@ -241,7 +231,7 @@ class Problem:
         changes: dict[str, Any] = {
             name: tuple(number[[k for k in getattr(self, name) if used[k]]].tolist()) for name in ("poses", "fixed")
         }
-        changes["names"] = tuple(name for name, keep in zip(self.names, used.tolist(), strict=True) if keep)
+        changes["names"] = tuple(compress(self.names, used))
         changes["factors"] = tuple(unchecked(factor, nodes=number[factor.nodes]) for factor in kept)
         return self.replace_unchecked(**changes, x0=frozen(x[used]), separator=())
 
@@ -332,8 +322,7 @@ _space = cache(Space)
 def indices(index: Callable[[Any], int], kind: str, nodes: Any) -> Ints:
     """Nodes (M, arity) of a kind from one node, a tuple or rows of them, each found by `index`."""
     arity = lookup(kind).arity
-    places = several(nodes)
-    flat = [p for row in places for p in (several(row) if isinstance(row, list | tuple | np.ndarray) else [row])]
+    flat = [node for row in several(nodes) for node in several(row)]
     if len(flat) % arity or not flat:
         raise InputError("nodes", nodes, f"must name {arity} points per {kind}", "Give points by name or index.")
     return np.array([index(p) for p in flat]).reshape(-1, arity)
@@ -367,6 +356,14 @@ def check_item(item: Factor | Constraint, names: Sequence[str], poses: frozenset
     if lacking := sorted(set(observers.ravel().tolist()) - poses):
         allowed = "must be a pose: the measurement is in its body frame"
         raise InputError(f"nodes of {item.kind}", names[lacking[0]], allowed, "Name it in Problem(names, poses=[...]).")
+
+
+def index_of(node: Any, place: Mapping[str, int], names: Sequence[str]) -> int:
+    """Index of a node given by name, which has a place, or index; InputError if there is none."""
+    index = place.get(node) if isinstance(node, str) else node
+    if not isinstance(index, int | np.integer) or not 0 <= index < len(names):
+        raise no_such_node(node, names)
+    return int(index)
 
 
 def no_such_node(

@@ -93,11 +93,8 @@ def exp(w: Floats) -> Floats:
            [ 1.,  0.]])
     """
     if w.shape[-1] == 1:
-        turned = np.empty((*w.shape[:-1], 2, 2))
-        turned[..., 0, 0] = turned[..., 1, 1] = np.cos(w[..., 0])
-        turned[..., 1, 0] = np.sin(w[..., 0])
-        turned[..., 0, 1] = -turned[..., 1, 0]
-        return turned
+        c, s = np.cos(w), np.sin(w)
+        return np.concatenate([c, -s, s, c], axis=-1).reshape(*w.shape[:-1], 2, 2)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     safe = np.where(angle > 1e-8, angle, 1.0)
     first = np.where(angle > 1e-8, np.sin(safe) / safe, 1.0)
@@ -156,8 +153,9 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
         raise InputError("position", f"shape {at.shape}", allowed, "Give x, y or x, y, z of each.")
     space = Space(at.shape[-1], has_rotation=True)
     wanted = at.shape[:-1] if space.dimension == 2 else (*at.shape[:-1], 3)
-    if w.ndim > len(wanted) or any(n not in (1, m) for n, m in zip(w.shape[::-1], wanted[::-1], strict=False)):
+    try:
+        turns = np.broadcast_to(w, wanted)
+    except ValueError:
         hint = "A heading for each position in the plane, a rotation vector in space."
-        raise InputError("turn", f"shape {w.shape}", f"must fit to {wanted}", hint)
-    w = w[..., None] if space.dimension == 2 else w
-    return space.join(at, exp(np.broadcast_to(w, (*at.shape[:-1], space.angles))))
+        raise InputError("turn", f"shape {w.shape}", f"must fit to {wanted}", hint) from None
+    return space.join(at, exp(turns.reshape(*at.shape[:-1], space.angles)))

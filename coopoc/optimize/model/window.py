@@ -65,11 +65,9 @@ def drive_factors(
 
 def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Factor]:
     """Factors of range, azimuth and inclination (M, 3): of the three where all are there, else of what is."""
-    if sensors is None:
-        std, factors = np.ones(3), _measured("displacement", edges, to_vector(relative), np.ones(3))
-    else:
-        std = relative_std(relative, sensors)
-        factors = _measured("spherical", edges, relative, std)
+    std = np.ones(3) if sensors is None else relative_std(relative, sensors)
+    kind, z = ("displacement", to_vector(relative)) if sensors is None else ("spherical", relative)
+    factors = _measured(kind, edges, z, std)
     partial = np.where(np.isfinite(relative).all(axis=1, keepdims=True), np.nan, relative)
     for k, kind in enumerate(("range", "azimuth", "inclination")):
         factors += _measured(kind, edges, partial[:, k, None], std[..., k, None])
@@ -107,7 +105,11 @@ def window(
     (column,) = recording.observing([ego])
     if noise is not None and not isinstance(noise, Noise):
         raise InputError("noise", shown(noise), "must be a noise model", "Give NoiseModel.nominal(sensors).")
-    _check(recording, step, length, run)
+    last, runs = len(recording.t) - 1, recording.runs
+    number("step", step, 0, last, kind=int, allowed=f"in 0..{last}", hint="The drive has no other steps.")
+    allowed = f"in 1..{step + 1} at step {step}"
+    number("length", length, 1, step + 1, kind=int, allowed=allowed, hint="Start later or shorten it.")
+    number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}", hint="A problem is one of the runs.")
     sensors: Sensors | None = recording.sensors
     if noise is None:
         fix_std = np.array(recording.sensors.gnss_std) * recording.fix_scale
@@ -126,11 +128,3 @@ def window(
     ids = [recording.ids[m] for m in member]
     names = ids if length == 1 else [f"{name}@{s}" for name, s in zip(ids, steps[order], strict=True)]
     return tuple(names), factors, tuple(np.flatnonzero(member == column).tolist())
-
-
-def _check(recording: Recording, step: int, length: int, run: int) -> None:
-    last, runs = len(recording.t) - 1, recording.runs
-    number("step", step, 0, last, kind=int, allowed=f"in 0..{last}", hint="The drive has no other steps.")
-    allowed = f"in 1..{step + 1} at step {step}"
-    number("length", length, 1, step + 1, kind=int, allowed=allowed, hint="Start later or shorten it.")
-    number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}", hint="A problem is one of the runs.")

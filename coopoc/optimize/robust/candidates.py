@@ -12,6 +12,8 @@ from ..assess.assess import squared
 from ..model.factor import Factor, reweighed
 from ..model.problem import Problem
 
+Inner = Callable[[Problem], Floats]
+"""Solves a weighted problem from its x0 and gives its nodes (n, ambient)."""
 Candidates = Sequence[int | tuple[int, Sequence[int]]]
 """Factors by their index, all rows of them or some: [0, (2, [1, 3])]."""
 

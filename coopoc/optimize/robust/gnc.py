@@ -12,8 +12,9 @@ from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import INLIER_WEIGHT, expected, implausible, rejection
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend
-from ..descent.levenberg_marquardt import arrive
+from ..descent.levenberg_marquardt import Arrival, arrive
 from ..graph_problems import started
+from ..model.factor import Loss
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
@@ -95,11 +96,11 @@ def solve_gnc(
     each, extras, began, doubts = list[int](), dict[str, Any](), clock(), tuple[str, ...]()
 
     def inner(part: Problem) -> Floats:
+        end: Solution | Arrival
         if problem.constraints:
-            solution = solve(part, backend, throw=False, covariance=False, **options)
-            each.append(solution.iterations)
-            return solution.x
-        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
+            end = solve(part, backend, throw=False, covariance=False, **options)
+        else:
+            end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
         each.append(end.iterations)
         return end.x
 
@@ -113,8 +114,7 @@ def solve_gnc(
 
     def cost(at: Floats) -> float:
         s = marked.squares(at) / marked.bound
-        spent = np.minimum(s, 1.0) if loss == "truncated" else s / (1.0 + s)
-        return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ spent)
+        return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ Loss(loss, 1.0).cost(s))
 
     try:
         from_known = known_start(marked, inner)
@@ -132,16 +132,18 @@ def solve_gnc(
         )
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
-    extras["start"] = best
     final = solve(marked.reweigh(end.weight, end.x), backend, throw=throw and end.settled, **options)
-    extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
-    work: dict[str, Any] = {"iterations": sum(each) + final.iterations}
-    work["solve_seconds"] = clock() - began - final.build_seconds - final.check_seconds
+    extras |= {"start": best, "weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < INLIER_WEIGHT).sum())
     notes = (rejection("GNC", out, len(end.weight), "candidates", final.cost, final.expected),) if out else ()
     solution = replace(
-        final, extras=final.extras | extras, status=status, notes=(*notes, *doubts, *final.notes), **work
+        final,
+        iterations=sum(each) + final.iterations,
+        solve_seconds=clock() - began - final.build_seconds - final.check_seconds,
+        status=status,
+        notes=(*notes, *doubts, *final.notes),
+        extras=final.extras | extras,
     )
     if throw and not end.settled:
         raise SolveError(solution)

@@ -13,9 +13,9 @@ from ..backend import MAX_ITERATIONS, TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
-from ..starts.mirrors import across, movable
+from ..starts.mirrors import Cost, Descend, across, movable
 from ..starts.race import drawn
-from .candidates import Marked, mark
+from .candidates import Inner, Marked, mark
 
 ROUNDS = 300
 """About 20 are needed."""
@@ -92,7 +92,7 @@ class Graduation(NamedTuple):
 def graduate(
     marked: Marked,
     surrogate: Surrogate,
-    inner: Callable[[Problem], Floats],
+    inner: Inner,
     x: Floats,
     mu: float,
     weight: Floats | None = None,
@@ -112,10 +112,10 @@ def graduate(
 def contest(
     marked: Marked,
     surrogate: Surrogate,
-    inner: Callable[[Problem], Floats],
+    inner: Inner,
     start: Floats,
-    finish: Callable[[Floats], Floats],
-    cost: Callable[[Floats], float],
+    finish: Descend,
+    cost: Cost,
 ) -> tuple[str, Floats, Graduation, tuple[str, ...]]:
     """The start of least cost after `finish`, its end (n, ambient), the graduation from the convex surrogate, notes.
 

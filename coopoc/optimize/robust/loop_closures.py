@@ -1,7 +1,6 @@
 """Loop closures by gating and consensus: candidates join known inliers where these predict them, as a start of GNC."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from ..model.space import carried
 from ..starts.graph_starts import parts
 from ..starts.initial import initial_guess
 from ..starts.pose_starts import along_poses
-from .candidates import Marked
+from .candidates import Inner, Marked
 
 ROUNDS = 100
 """About 15 are needed: half of those that fit join in each."""
@@ -41,25 +40,9 @@ WORLD_BODY = -1
 HINT = 'Name fewer measurements as candidates, or use start="all".'
 
 
-@dataclass(frozen=True, eq=False)
-class KnownStart:
-    """Where the known inliers lead.
-
-    Args:
-        x: (n, ambient) nodes.
-        weight: (G,) of the candidates.
-        rounds: that it took.
-        joined: for each body that candidates joined to another, how many agreed.
-    """
-
-    x: Floats
-    weight: Floats
-    rounds: int
-    joined: tuple[dict[str, Any], ...]
-
-
-def known_start(marked: Marked, inner: Callable[[Problem], Floats]) -> KnownStart:
-    """Candidates join where the others predict them: first within what known inliers hold together, then between.
+def known_start(marked: Marked, inner: Inner) -> "Decided":
+    """Where known inliers lead: candidates join where the others predict them, first within what known inliers hold
+    together, then between.
 
     A candidate fits where d^2 = r^T (J P J^T + cov)^-1 r is within its bound, P the covariance of its nodes given all
     that has joined. Of those that fit the half that is predicted best, by log det(J P J^T + cov), joins in each round,
@@ -83,13 +66,13 @@ def known_start(marked: Marked, inner: Callable[[Problem], Floats]) -> KnownStar
         gate of a predicted measurement. Olson, Agarwal, IJRR 2013, and Mangelson et al., ICRA 2018, on graphs.
         Fischler, Bolles, Random Sample Consensus, 1981.
     """
-    search, rounds, joined = _Search(marked), 0, list[dict[str, Any]]()
+    decided = Decided(marked)
     while True:
-        body = search.bodies()
-        rounds += search.grow(body, inner)
+        body = decided.bodies()
+        decided.grow(body, inner)
         if (body == WORLD_BODY).all():
-            return KnownStart(search.x, search.weight, rounds, tuple(joined))
-        joined.append(search.join(search.bodies()))
+            return decided
+        decided.join(decided.bodies())
 
 
 class Placement(NamedTuple):
@@ -115,21 +98,28 @@ class Placement(NamedTuple):
         return int(self.fits.sum()), -self.misfit
 
 
-class _Search:
-    """What has been decided: x (n, ambient), each free body in a frame of its own; weight (G,) of the candidates that
-    have joined; left (G,) how often each has left."""
+class Decided:
+    """What has been decided.
+
+    Attributes:
+        x: (n, ambient), each free body in a frame of its own.
+        weight: (G,) of the candidates that have joined.
+        left: (G,) how often each has left.
+        rounds: that it took.
+        joined: for each body that candidates joined to another, how many agreed.
+    """
 
     def __init__(self, marked: Marked) -> None:
         self.problem, self.marked, self.bound = marked.problem, marked, marked.bound
         self.weight, self.left = np.zeros(len(self.bound)), np.zeros(len(self.bound), dtype=np.int64)
+        self.rounds, self.joined = 0, tuple[dict[str, Any], ...]()
         self.x = along_poses(marked.reweigh(self.weight, initial_guess(self.problem)))
 
     def bodies(self) -> Ints:
         """(n,) the body of each node, WORLD_BODY or its first pose (if it has none, its first node)."""
         problem = self.problem
         measured = [f.nodes[f.informative] for f in self.marked.reweigh(self.weight, self.x).factors]
-        pairs = (nodes[:, k : k + 2] for nodes in measured for k in range(nodes.shape[1] - 1))
-        part = parts(len(problem.names), *pairs)
+        part = parts(len(problem.names), *measured)
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
         first = nodes[np.unique(part[nodes], return_index=True)[1]]
@@ -146,7 +136,7 @@ class _Search:
             end_of[here, 2 - nodes.shape[1] :] = body[nodes]
         return np.sort(end_of, axis=1)
 
-    def grow(self, body: Ints, inner: Callable[[Problem], Floats]) -> int:
+    def grow(self, body: Ints, inner: Inner) -> None:
         """Rounds of the problem with the bodies pinned, until no more candidates join within them."""
         marked = replace(self.marked, problem=pinned(self.problem, body))
         bound, weight, left, ends = self.bound, self.weight, self.left, self.ends(body)
@@ -169,7 +159,7 @@ class _Search:
                 some = some[np.argsort(-volume[some], kind="stable")][:MAX_RESOLVES]
                 if not any(self._explained(marked, group) for group in some.tolist()):
                     break
-        return rounds
+        self.rounds += rounds
 
     def _explained(self, marked: Marked, group: int) -> bool:
         """Whether twice the cost grows by no more than the bound where a group joins, which it then does.
@@ -185,8 +175,8 @@ class _Search:
         self.weight[group] = float(good)
         return bool(good)
 
-    def join(self, body: Ints) -> dict[str, Any]:
-        """Take the placement with which most candidates agree, over all pairs of bodies, and describe it."""
+    def join(self, body: Ints) -> None:
+        """Take the placement with which most candidates agree, over all pairs of bodies."""
         problem, marked, between = self.problem, self.marked, self.ends(body)
         first = np.unique(marked.group, return_index=True)[1]
         own = between[first]  # of each group
@@ -214,7 +204,7 @@ class _Search:
             allowed = "must join what known inliers leave free, two and more that agree"
             raise InputError("candidates", what, allowed, HINT)
         self.x, self.weight[best.group] = self._placed(body, best.bodies[1], best.move), 1.0
-        return joined
+        self.joined = *self.joined, joined
 
     def _placed(self, body: Ints, moving: int, move: Floats) -> Floats:
         """(n, ambient) nodes with a body moved."""

@@ -86,7 +86,7 @@ def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools
 
 
 def parts(n: int, *joined: Ints) -> Ints:
-    """(n,) the connected component that each is in, by pairs, (M, 2) each, that are joined; counted by first nodes.
+    """(n,) the connected component that each is in, by nodes (M, arity) that are joined; counted by first nodes.
 
     >>> parts(4, np.array([[3, 1]])).tolist()
     [0, 1, 2, 1]
@@ -94,9 +94,19 @@ def parts(n: int, *joined: Ints) -> Ints:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    pairs = stacked(joined, 2)
+    pairs = stacked((nodes[:, k : k + 2] for nodes in joined for k in range(nodes.shape[1] - 1)), 2)
     part: Ints = connected_components(csr_array((np.ones(len(pairs)), pairs.T), (n, n)), directed=False)[1]
     return part
+
+
+def loose_firsts(part: Ints, nodes: Ints, held: Ints) -> Ints:
+    """The first of the nodes in each part of all (n,) in which nothing is held.
+
+    >>> loose_firsts(np.array([0, 0, 1, 1]), np.array([1, 2, 3]), np.array([0])).tolist()
+    [2]
+    """
+    loose = nodes[~np.isin(part[nodes], part[held])]
+    return loose[np.unique(part[loose], return_index=True)[1]]
 
 
 def trilaterate(places: Floats, ranges: Floats) -> Floats:
@@ -238,15 +248,13 @@ def unwound(graph: Graph, x: Floats) -> bool:
     if len(graph.ranges) or len(graph.relative_point) or len(graph.pose_prior) > 1:
         return False
     edges = graph.relative_pose
-    if not len(edges):
-        return True
     (i, j), turned = edges.nodes.T, Space(graph.dimension, has_rotation=True).rotation(x)
     error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
     if graph.dimension == 3:
         return bool(np.linalg.norm(error, axis=1).sum() < np.pi)
     tree = walk(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
     along = log(np.swapaxes(tree, 1, 2) @ turned)  # more than half a turn of it shows as a jump on an edge
-    return bool(np.abs(along[i] + error - along[j]).max() < WOUND)
+    return bool(np.abs(along[i] + error - along[j]).max(initial=0.0) < WOUND)
 
 
 def separated(graph: Graph, x0: Floats) -> Floats:

@@ -36,13 +36,20 @@ MOST_RANGED = 6
 """Points with most ranges to others that are tried for the next one that is placed."""
 
 
+Descend = Callable[[Floats], Floats]
+"""From nodes (n, ambient) to a minimum."""
+Cost = Callable[[Floats], float]
+"""Of nodes (n, ambient)."""
 Move = tuple[float, Floats, Ints]
 """What it adds to the cost of the ranges of a body, its nodes there, and the body."""
 
 
 class Ranges(NamedTuple):
-    """M ranges: nodes (M, 2), distance (M,) m, weight (M,) 1/m and the loss of each, None for least squares."""
+    """M ranges of a problem at x: nodes (M, 2), distance (M,) m, weight (M,) 1/m and the loss of each, None for least
+    squares."""
 
+    problem: Problem
+    x: Floats
     nodes: Ints
     distance: Floats
     weight: Floats
@@ -63,7 +70,7 @@ def ranges_of(problem: Problem, x: Floats) -> Ranges:
     own = np.repeat(np.arange(len(factors)), [len(f.nodes) for f in factors])
     distance = stacked(f.z[:, 0] - x[f.nodes[:, 2:], 0].sum(axis=1) for f in factors)
     nodes, weight = stacked((f.nodes[:, :2] for f in factors), 2), stacked(f.root[:, 0, 0] for f in factors)
-    return Ranges(nodes, distance, weight, tuple((own == k, f.loss) for k, f in enumerate(factors)))
+    return Ranges(problem, x, nodes, distance, weight, tuple((own == k, f.loss) for k, f in enumerate(factors)))
 
 
 def bodies(problem: Problem, x: Floats) -> list[Ints]:
@@ -80,7 +87,7 @@ def bodies(problem: Problem, x: Floats) -> list[Ints]:
     """
     vague = RANGES + LEVEL * (problem.dimension == 3)
     others = [f.nodes[f.informative] for f in problem.factors if f.kind not in vague]
-    part = parts(len(problem.names), *(n[:, k : k + 2] for n in others for k in range(n.shape[1] - 1)))
+    part = parts(len(problem.names), *others)
     alone = (_accepted(problem, f, x) for f in problem.factors if f.nodes.shape[1] == 1)
     held = np.concatenate([np.array(problem.fixed, np.int64), *alone])
     return [np.flatnonzero(part == body) for body in np.setdiff1d(part, part[held])]
@@ -173,15 +180,20 @@ def _mirrored(problem: Problem, nodes: Floats, plane: tuple[Floats, Floats]) -> 
     return space.join(moved, turn @ space.rotation(nodes))
 
 
-def _all_mirrored(problem: Problem, ranges: Ranges, x: Floats, loose: list[Ints]) -> Iterator[Floats]:
+def _outward(ranges: Ranges, body: Ints) -> tuple[Ints, Ints, Ints]:
+    """Rows of the ranges with weight from a body to what is not of it, their nodes of it and the others."""
+    inside = np.isin(ranges.nodes, body)
+    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))
+    return rows, ranges.nodes[rows][inside[rows]], ranges.nodes[rows][~inside[rows]]
+
+
+def _all_mirrored(ranges: Ranges, loose: list[Ints]) -> Iterator[Floats]:
     """All bodies together, reflected at the plane of what ranges any of them: ranges among them hold them there."""
     if len(loose) < 2:
         return
-    inside = np.isin(ranges.nodes, np.concatenate(loose))
-    rows = inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0)
-    if rows.sum() < 2:
+    problem, x, (rows, _, outside) = ranges.problem, ranges.x, _outward(ranges, np.concatenate(loose))
+    if len(rows) < 2:
         return
-    outside = ranges.nodes[rows][~inside[rows]]
     plane, y = _plane(problem.space.position(x[outside])), x.copy()
     for body in loose:
         y[body] = _mirrored(problem, x[body], plane)
@@ -191,18 +203,16 @@ def _all_mirrored(problem: Problem, ranges: Ranges, x: Floats, loose: list[Ints]
         yield y
 
 
-def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[Move]:
+def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
     """Other places of a body, the cheapest first.
 
     It is reflected at the best-fit plane of what ranges it, keeping its handedness, and a point is also put where its
     spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image.
     """
-    space, d, inside = problem.space, problem.dimension, np.isin(ranges.nodes, body)
-    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))
+    problem, x, (rows, own, other) = ranges.problem, ranges.x, _outward(ranges, body)
+    space, d = problem.space, problem.dimension
     if len(rows) < 2:
         return []
-    first = inside[rows, 0]
-    own, other = (np.where(side, *ranges.nodes[rows].T) for side in (first, ~first))
     places, at = space.position(x[other]), space.position(x[body])
     plane = _plane(places)
     flipped = _image(at, plane)
@@ -224,16 +234,17 @@ def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[
     return [(float(after - before), there, body)]
 
 
-def _moves(problem: Problem, ranges: Ranges, x: Floats, single: list[Move]) -> Iterator[Floats]:
+def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
     """Points (n, ambient) to descend from: all bodies where they cost less, one after the other, then one at a time,
     and several together."""
+    x = ranges.x
     if any(adds < 0 for adds, _, _ in single):
         y = x.copy()
         for *_, body in single:
-            if (moves := _elsewhere(problem, ranges, y, body)) and moves[0][0] < 0:
+            if (moves := _elsewhere(ranges._replace(x=y), body)) and moves[0][0] < 0:
                 y[body] = moves[0][1]
         yield y
-    yield from _all_mirrored(problem, ranges, x, [*{int(body[0]): body for *_, body in single}.values()])
+    yield from _all_mirrored(ranges, [*{int(body[0]): body for *_, body in single}.values()])
     near = [move for move in single if move[0] <= TRY * (1.0 + len(ranges.nodes) / len(x))][:TRIED]
     together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
     for chosen in islice(together, TRIED):
@@ -243,9 +254,7 @@ def _moves(problem: Problem, ranges: Ranges, x: Floats, single: list[Move]) -> I
         yield y
 
 
-def across(
-    problem: Problem, x: Floats, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
-) -> tuple[Floats, int, list[float], list[Ints]]:
+def across(problem: Problem, x: Floats, descend: Descend, cost: Cost) -> tuple[Floats, int, list[float], list[Ints]]:
     """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
     moves led down, the costs of the other ends, and the bodies that ranges or level directions hardly
     distinguish from elsewhere.
@@ -263,11 +272,9 @@ def across(
     rivals, single = list[float](), list[Move]()
     while count < ROUNDS:
         ranges = ranges_of(problem, x)
-        single = sorted(
-            (move for body in loose for move in _elsewhere(problem, ranges, x, body)), key=lambda move: move[0]
-        )
+        single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
         rivals = []
-        for start in _moves(problem, ranges, x, single):
+        for start in _moves(ranges, single):
             end = descend(start)
             if (now := cost(end)) < (1.0 - SAME) * least - 1e-9:
                 x, least, count = end, now, count + 1

@@ -61,8 +61,7 @@ def graph_of(problem: Problem) -> Graph:
     if not all(map(NAME.fullmatch, names)):
         part = parts(n, *(nodes for nodes, *_ in rows["relative_pose"]))
         names = tuple(f"{chr(65 + part[k] % 26)}{k}" for k in range(n))
-    unknown = np.full((n, d), np.nan)
-    return Graph(d, names, poses, unknown, unknown[:, :1] if d == 2 else np.full((n, 4), np.nan), **edges)  # type: ignore[arg-type]
+    return Graph(d, names, poses, np.full((n, d), np.nan), np.full((n, 1 if d == 2 else 4), np.nan), **edges)  # type: ignore[arg-type]
 
 
 def along_poses(problem: Problem) -> Floats:

@@ -11,7 +11,7 @@ from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
 from ..model.factor import reweighed, taken
 from ..model.problem import Problem, Search
-from .mirrors import RANGES, across, regrown, scaled
+from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -212,9 +212,7 @@ def smooth(end: Arrival) -> bool:
     return bool(not damping.any() and (np.abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
 
 
-def drawn(
-    problem: Problem, x: Floats, loose: Ints, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
-) -> tuple[Floats, tuple[str, ...]]:
+def drawn(problem: Problem, x: Floats, loose: Ints, descend: Descend, cost: Cost) -> tuple[Floats, tuple[str, ...]]:
     """The lowest end (n, ambient) of descents from x and from random places of the `loose` points, each `regrown` while
     that leads lower; and what makes it doubtful: no other start leads there, or some lead elsewhere for about the same
     cost.
