@@ -19,7 +19,7 @@ import coopoc as co
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
-from coopoc.optimize.assess.assess import SMALL, _seen, assess, expected, newton_decrease
+from coopoc.optimize.assess.assess import SMALL, _seen, as_stated, assess, expected, newton_decrease
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph, read_graph
@@ -156,10 +156,23 @@ def test_a_formula_that_casadi_cannot_run_is_refused():
 def test_marginals_are_those_of_gtsams_bayes_tree(dimension):
     problem = from_graph(random_graph(211, dimension, steps=60))
     found = solve(problem)
-    theirs = bayes_tree_marginals(problem.whiten(found.x)[1], ~problem.movable, len(problem.names), problem.space.dof)
+    theirs = bayes_tree_marginals(
+        as_stated(problem).whiten(found.x)[1], ~problem.movable, len(problem.names), problem.space.dof
+    )
     still = ~problem.movable
     theirs[still[:, :, None] | still[:, None, :]] = 0.0
     assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
+
+
+@pytest.mark.parametrize("objective", ["chordal", "geodesic"])
+def test_marginals_of_a_chain_in_the_plane_are_those_of_its_noise(objective, tmp_path):
+    """Closed form: four steps of 1 m, 0.1 m and 0.2 rad each; beside a constraint that does not hold, too."""
+    steps = "\n".join(f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 25" for k in range(4))
+    (path := tmp_path / "chain.g2o").write_text(steps)
+    problem = read_graph(path, objective)
+    x = solve(problem).x
+    for each in (problem, problem.constrain("range", (0, 4), upper=9.0)):
+        assert assess(each, x).covariance[4].diagonal() == pytest.approx([0.04, 0.04 + 0.04 * 14, 0.16], rel=1e-6)
 
 
 def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_bayes_tree():
@@ -169,7 +182,7 @@ def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_ba
     first, last = problem.names[0], problem.names[-1]
     found = assess(problem.constrain("range", (first, last), upper=1e6), x)
     still = ~problem.movable
-    theirs = bayes_tree_marginals(problem.whiten(x)[1], still, len(problem.names), problem.space.dof)
+    theirs = bayes_tree_marginals(as_stated(problem).whiten(x)[1], still, len(problem.names), problem.space.dof)
     theirs[still[:, :, None] | still[:, None, :]] = 0.0
     assert len(problem.names) > SMALL
     assert found.active is not None
