@@ -62,7 +62,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     in the plane, 3 / (2 trace(cov_R)) in space: quadratic, so that it can be certified. These are the weights of CORA
     (arXiv 2302.11614), and those of SE-Sync (Rosen et al., IJRR 2019) where heading and position are not correlated;
     else SE-Sync's kappa is the information of theta, which is larger. Covariances are those of the variances, not of
-    these weights. geodesic: |R_ij^T (R_i^T (t_j - t_i) - t_ij)|^2 and |log(R_ij^T R_i^T R_j)|^2 with the full covariance.
+    these weights. geodesic: R_ij^T (R_i^T (t_j - t_i) - t_ij) and log(R_ij^T R_i^T R_j) with the full covariance.
 
     Args:
         graph: of `coopoc.formats.load_graph`.
