@@ -13,7 +13,7 @@ from coopoc.optimize.convex import certify
 from coopoc.optimize.graph_problems import _counted
 
 
-def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float) -> Problem:
+def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float | Floats) -> Problem:
     """A robot that ranges anchors in the plane."""
     count = len(anchors)
     problem = Problem((*map(str, range(count)), "r"), x0=np.vstack([anchors, start]), fixed=range(count), dimension=2)
@@ -49,6 +49,21 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     assert singular == (abs((x - truth) @ across) < 1e-4)
     if singular:
         assert found.covariance[3] == pytest.approx(np.linalg.inv(np.array(hessian) / 4e-6), rel=1e-3)
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+@pytest.mark.parametrize("degrees", [0, 20, 45])
+def test_a_strict_minimum_is_one_wherever_the_axes_are(degrees, offset, backend):
+    """On the line of its anchors, of ranges that fit there alone: of one precision, and of 1 mm beside 0.5 m."""
+    turn = np.array([[c := np.cos(np.deg2rad(degrees)), s := np.sin(np.deg2rad(degrees))], [-s, c]])
+    for anchors, start, ranges, std in (
+        ([0, 10, 25], [4, 0.7], [3.9, 5.8, 20.75], 0.1),
+        ([0, 4.5], [9, 1e-3], [9.0, 3.7], np.array([[1e-3], [0.5]])),
+    ):
+        at = np.outer(anchors, [1.0, 0.0]) @ turn + offset
+        problem = ranged(at, np.array(start) @ turn + offset, np.array(ranges), std)
+        assert solve(problem, backend, throw=False).status is Status.SOLVED
 
 
 def test_a_saddle_between_two_anchors_is_one():

@@ -161,7 +161,8 @@ class Incremental:
         self, part: Problem, keys: Sequence[int], first: int, x: Floats, new: Collection[int]
     ) -> dict[int, Floats]:
         """(d, d) information about new points and those that are still steadied, given all other nodes."""
-        d, told = part.dimension, {k: np.zeros((part.dimension,) * 2) for k in new}
+        d = part.dimension
+        told: dict[int, Floats] = {k: np.zeros((d, d)) for k in new}
         told |= {k: self._steadied[k][1].copy() for k in keys if k in self._steadied}
         if told and part.factors:
             linear = linearise(part.space, part.factors, None, self._at(part, keys, first, x))
@@ -211,7 +212,7 @@ class Incremental:
         if loose:
             at = self._at(part, keys, first, x)
             points = np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
-            vague = [Factor("position", points[:, None], at[points, :d], std=[LOOSE] * d)] if len(points) else []
+            vague = [Factor("position", points[:, None], at[points, :d], std=np.full(d, LOOSE))] if len(points) else []
             known = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
             free = [keys[part.index(name)] for name in assess(known, at, covariance=False).unobservable]
             loose &= {*free} | (loose - {*keys})

@@ -30,8 +30,10 @@ SMALL = 200
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
 rounding."""
-REST = 1e-6
-"""m or rad, a step within which a point is stationary."""
+FLAT = 1e-9
+"""Curvature, as a share of the diagonal of J^T J, that is rounding."""
+LEVER = 0.1
+"""m or rad, least radius of a way along which no measurement changes."""
 TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
 MANY = 0.25
@@ -117,7 +119,7 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
         far = float(np.abs(dx).max(initial=0.0))
         return Assessment(cost, size, cov, far, predicted=0.5 * abs(float(gradient @ dx)), curved=curved)
 
-    own, cov = _largest(problem, entries, values), none
+    own, cov = _largest(problem, entries, values[entries.diagonal]), none
     step = variance = np.full(entries.size, np.inf)
     if held := cholesky.factor(values):
         step, variance = cholesky.solve(gradient), 1.0 / cholesky.pivots
@@ -125,27 +127,27 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
             cov, variance = _inverse(problem, x, "gauss-newton")
         if (variance * own < INFLATION).all():
             return ended(cov, step)
-    eased, exact = values.copy(), None
-    eased[entries.diagonal] += SLACK * own + (own == 0)
-    calm = cholesky.solve(gradient) if cholesky.factor(eased) else step
-    if not problem.linear and np.abs(calm).max(initial=0.0) <= REST:
-        exact = system.quadratic(x, "newton")[2]
-    bent = None if exact is None else (_symmetric(entries, exact), np.sqrt(own + (own == 0)))
+    exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
+    if not problem.linear and np.isfinite(exact).all():
+        scale, slope = own + (own == 0), _largest(problem, entries, np.abs(gradient))
+        flat = FLAT + (slope / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
+        bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return replace(unknown, unobservable=nodes)
-    if exact is None:
+    if bent is None:
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):
-        return ended(none, calm, True)
+        values[entries.diagonal] += SLACK * own + (own == 0)
+        return ended(none, cholesky.solve(gradient) if cholesky.factor(values) else step, True)
     newton = cholesky.solve(gradient)
     inverse, less = _inverse(problem, x, "newton")
     return ended(inverse, newton, True) if (2.0 * less < variance).any() else ended(cov, step)
 
 
-def _largest(problem: Problem, entries: Entries, values: Floats) -> Floats:
-    """(m,) the largest entry on the diagonal among the positions, or the turns, of the node of each unknown."""
+def _largest(problem: Problem, entries: Entries, numbers: Floats) -> Floats:
+    """(m,) the largest of such numbers among the positions, or the turns, of the node of each unknown."""
     number, d = entries.number, problem.dimension
-    table = np.append(values[entries.diagonal], 0.0)[number]
+    table = np.append(numbers, 0.0)[number]
     for part in (table[:, :d], table[:, d:]):
         part[:] = part.max(axis=1, initial=0.0, keepdims=True)
     return table[number >= 0]
@@ -205,13 +207,14 @@ def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats
 
 
 def _unobservable(
-    problem: Problem, J: Any, active: Active | None, bent: tuple[Any, Floats] | None = None
+    problem: Problem, J: Any, active: Active | None, bent: tuple[Any, Floats, Floats] | None = None
 ) -> tuple[str, ...]:
     """Nodes that take part in a direction which no measurement sees: the null space of J with unit columns.
 
-    Where `bent` has the exact Hessian H (m, m) at a stationary point and scales D^1/2 (m,) of the unknowns, only along
-    which D^-1/2 H D^-1/2 is flat, too: between two anchors that are too close together, a node is held across their
-    line by the curvature of ranges that are too short, and pushed off it by longer ones.
+    Where `bent` has the exact Hessian H (m, m), scales D^1/2 (m,) of the unknowns and shares (m,), only along which
+    D^-1/2 H D^-1/2 is no larger than its share, too: between two anchors that are too close together, a node is held
+    across their line by the curvature of ranges that are too short, and pushed off it by longer ones. A gradient bends
+    a direction that nothing sees by as much as its share: along a circle about an anchor by |g| / radius.
     """
     from scipy.sparse import eye_array
 
@@ -225,7 +228,7 @@ def _unobservable(
         moves = np.square(null).sum(axis=0) + ways[:, ~measured].power(2).sum(axis=1)
         moves = moves * problem.movable.ravel()
     else:
-        hessian, scale = bent
+        hessian, scale, flat = bent
         moving = np.flatnonzero(problem.movable)
         lost, curved = ~measured[moving], abs(hessian).sum(axis=0) > 0
         every = np.zeros((J.shape[1], len(null)))
@@ -234,7 +237,8 @@ def _unobservable(
         basis = np.linalg.qr(np.hstack([scale[:, None] * every[moving], own]))[0]
         values, turned = np.linalg.eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
         moves = np.zeros(J.shape[1])
-        moves[moving] = np.square(basis @ turned[:, np.abs(values) <= SLACK]).sum(axis=1) + (lost & ~curved)
+        ways_squared = np.square(basis @ turned)
+        moves[moving] = ways_squared[:, np.abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
     moves = moves.reshape(len(problem.names), -1).sum(axis=1)
     return tuple(compress(problem.names, moves > 1e-6))
 
