@@ -83,6 +83,11 @@ def test_a_certified_mirror_image_is_not_unique():
     fixed = pair.add("position", "r", [5, 5], std=1.0)
     verdict = certify(fixed, solve(fixed))
     assert (verdict.certified, verdict.unique) == (True, True)
+    free = Problem("abc", dimension=2, x0=[[0, 0], [3, 0], [3, 4]]).add("range", (0, 2), 5.2, std=0.1)
+    free = free.add("displacement", [(0, 1), (1, 2)], [[3.0, 0.1], [0.1, 4.0]], std=0.2)
+    verdict = certify(free, solve(free, throw=False))
+    assert (verdict.certified, verdict.unique) == (True, False)
+    assert "a motion of all" in str(verdict)
 
 
 @pytest.mark.parametrize("seed", range(8))
