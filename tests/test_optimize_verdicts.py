@@ -124,5 +124,13 @@ def test_bounds_that_push_are_no_local_minimum():
     assert held(-1.0).expected == 0
 
 
+def test_a_convex_problem_has_no_local_minimum():
+    apart = Problem("ab", dimension=2).add("position", ["a", "b"], [[0, 0], [10, 0]], std=0.5)
+    apart = apart.constrain("displacement", ("a", "b"), lower=[4.0, 0], upper=[4.0, 0])
+    assert "explains 1 +- 1: constraints of displacement that contradict" in solve(apart).notes[-1]
+    free = Problem("abc", dimension=2).add("displacement", [(0, 1), (1, 2), (0, 2)], [[1, 0], [1, 0], [2.1, 0]], 0.1)
+    assert solve(free, throw=False).cost == pytest.approx(0.1**2 / 6 / 0.1**2)
+
+
 def test_what_is_said_of_many_lines_is_said_once():
     assert _counted([f"line {k}: repaired" for k in range(5021)]) == ["5021 times, first in line 0: repaired"]

@@ -374,12 +374,15 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
     most, spread = expected(problem, out) if pushing else (mean, variance)
     if implausible(truth.cost - spent, most, spread):
-        why = "a local minimum (try other x0, or certify it)"
+        convex = problem.linear and all(c.measurement.linear for c in problem.constraints)
+        whys = [] if convex or pushing else ["a local minimum (try other x0, or certify it)"]
         if pushing:
-            why = f"{pushing} bounds that push contradict the measurements"
+            whys += [f"{pushing} bounds that push contradict the measurements"]
+        elif equal := sorted({c.kind for c in problem.constraints if (c.lower == c.upper).any()}):
+            whys += [f"constraints of {', '.join(equal)} that contradict the measurements"]
+        why = ", ".join([*whys, "outliers, or noise that is stated too small"])
         notes.append(
-            f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: "
-            f"{why}, outliers, or noise that is stated too small"
+            f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: {why}"
         )
     return mean + spent, tuple(notes)
 

@@ -87,7 +87,8 @@ def arrive(
     both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines.
 
     References:
-        Chamberlain et al., The watchdog technique, 1982; More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
+        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3;
+        Chamberlain et al., The watchdog technique, 1982.
     """
     mu, against, cholesky = 0.0, 0, system.cholesky
 
