@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
-from random_graphs import star
+from random_graphs import random_graph, star
 
 from coopoc import V2X, Sensors, load_fleet, observe
 from coopoc.optimize import (
@@ -25,12 +25,11 @@ from coopoc.optimize import (
     Solution,
     Status,
     backends,
-    pose,
     solve,
     solve_gnc,
 )
 from coopoc.optimize.backend import require_backend
-from coopoc.optimize.model.space import exp
+from coopoc.optimize.graph_problems import from_graph
 
 
 def spherical() -> Problem:
@@ -41,25 +40,10 @@ def spherical() -> Problem:
     return Problem.from_snapshot(seen, 30, 24)
 
 
-def drive(dimension: int, kind: str) -> Problem:
-    """Two robots of six poses each: odometry, ranges between them at every step, the first pose held."""
-    rng, d = np.random.default_rng(dimension), dimension
-    turn = 0.3 * rng.normal(size=(12, 1 if d == 2 else 3))
-    at = np.concatenate([np.arange(6)[:, None] * 4.0 + 9.0 * row + np.zeros((6, d)) for row in (0, 1)])
-    at = at + 0.5 * rng.normal(size=at.shape)
-    truth = pose(at, turn[:, 0] if d == 2 else turn)
-    names = [f"{robot}{k}" for robot in "AB" for k in range(6)]
-    problem = Problem(names, x0=truth, dimension=d, poses=names, fixed=("A0",))
-    space, p, R = problem.space, problem.space.position(truth), problem.space.rotation(truth)
-    pairs = [(i, i + 1) for i in (*range(5), *range(6, 11))] + [(0, 6)]
-    z = []
-    for i, j in pairs:
-        step = R[i].T @ (p[j] - p[i]) + 0.1 * rng.normal(size=d)
-        z.append(space.join(step, R[i].T @ R[j] @ exp(0.02 * rng.normal(size=turn.shape[1]))))
-    size = {"relative_pose": d + turn.shape[1], "relative_pose_chordal": d + d * d}[kind]
-    problem = problem.add(kind, [(names[i], names[j]) for i, j in pairs], z, std=[0.1] * d + [0.02] * (size - d))
-    ranges = np.linalg.norm(p[6:] - p[:6], axis=1) + 0.2 * rng.normal(size=6)
-    return problem.add("range", [(f"A{k}", f"B{k}") for k in range(6)], ranges[:, None], std=0.2)
+def drive(dimension: int, objective: Any) -> Problem:
+    """Two robots of six poses each from the truth: odometry, loops, and ranges between them, the first pose held."""
+    graph = random_graph(dimension, dimension, steps=6, landmarks=0, loops=4, ranges=8, seen=0, step_std=0.1)
+    return from_graph(graph, objective, "file")
 
 
 def linear() -> Problem:
@@ -82,9 +66,9 @@ def bounded() -> Problem:
 CASES: dict[str, Callable[[], Problem]] = {
     "range-only": partial(star, "range", 2, fix_std=3.5, height=0.3),
     "spherical K = 10": spherical,
-    "SE(2) window": lambda: drive(2, "relative_pose"),
-    "SE(3) window": lambda: drive(3, "relative_pose"),
-    "SE(2) chordal": lambda: drive(2, "relative_pose_chordal"),
+    "SE(2) window": lambda: drive(2, "geodesic"),
+    "SE(3) window": lambda: drive(3, "geodesic"),
+    "SE(2) chordal": lambda: drive(2, "chordal"),
     "linear": linear,
     "active bound": bounded,
 }

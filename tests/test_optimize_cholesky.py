@@ -1,11 +1,14 @@
 """The sparse Cholesky factor against NumPy's dense one: solves, definiteness, entries of the inverse."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from coopoc.kernels.graphs.multifrontal import supernodes
-from coopoc.optimize.algebra.cholesky import Cholesky
+from coopoc.optimize.algebra.cholesky import Cholesky, DenseCholesky
 
 
 def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
@@ -71,3 +74,18 @@ def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():
     parent[-1] = -1
     found = supernodes(parent, begin, rows, np.ones(n, np.int64))
     assert found.tolist() == [0, 5, 10, 15, 20]
+
+
+def test_small_matrices_are_factored_by_one_thread():
+    """Of two cores that share 150 rows each waits for the other, a hundred times as long as one alone takes."""
+    cholesky, threads = DenseCholesky(np.arange(151), np.arange(150)), set[int]()
+    whole = cholesky._dpotrf
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        threads.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+        return whole(*arguments, **options)
+
+    cholesky._dpotrf = counted
+    with threadpool_limits(2):
+        assert cholesky.factor(np.ones(150))
+    assert threads == {1}

@@ -66,3 +66,14 @@ def test_a_bar_shows_steps_and_cost(backend, monkeypatch, capsys):
     shown = co.solve(ranged(), backend)
     assert "cost" in capsys.readouterr().err
     assert np.array_equal(shown.position, quick.position)
+
+
+def test_a_drive_that_turns_as_a_whole_needs_few_steps():
+    """Straight lines move its far end off the circle; the next step corrects that, and both keep what was promised."""
+    n, turn = 400, np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    x0 = co.pose(np.outer(np.arange(n), [1.0, 0.0]) @ turn, np.full(n, 0.5))
+    drive = Problem(range(n), dimension=2, poses=range(n), x0=x0).add("pose", 0, co.pose([0, 0], 0.0), std=0.01)
+    moved = np.tile(co.pose([1.0, 0.0], 0.0), (n - 1, 1))
+    found = solve(drive.add("relative_pose", [(k, k + 1) for k in range(n - 1)], moved, std=[0.02, 0.02, 0.01]))
+    assert found.cost < 1e-9
+    assert found.iterations <= 5

@@ -45,6 +45,15 @@ def test_a_cost_that_the_noise_does_not_explain_is_noted():
     assert 0 < sum(noted) < len(noted)
 
 
+@pytest.mark.parametrize(
+    "noise", [{"std": [np.inf, np.inf, 0.1]}, {"sqrt_information": 10 * np.eye(3)[[2, 2, 2]] / 3**0.5}]
+)
+def test_what_is_not_measured_is_no_number(noise):
+    heights = Problem("a").add("position", "a", [0, 0, 0], std=[1.0, 1.0, np.inf])
+    heights = heights.add("position", ["a"] * 100, np.zeros((100, 3)), **noise)
+    assert solve(heights).expected == pytest.approx(99 / 2)
+
+
 def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones():
     torn = Problem(("o", "a"), x0=np.eye(2, 3), fixed=(0,))
     torn = torn.add("displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0, loss=Loss("truncated", 1.0))

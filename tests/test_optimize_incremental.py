@@ -90,6 +90,26 @@ def test_marginals_are_gtsams_in_the_worlds_directions():
     assert live.marginal("x9") == pytest.approx(exact, abs=0.03 * scale)
 
 
+@pytest.mark.parametrize(("z", "std"), [([5e5, 5e6], 3.0), ([20.0, 0.0], 300.0)])
+def test_a_guess_has_no_weight(z, std):
+    """Closed form: the fix itself."""
+    live = co.incremental(co.Problem("a", dimension=2, x0=np.zeros((1, 2))).add("position", "a", z, std=std))
+    assert live["a"] == pytest.approx(z, rel=1e-6, abs=1e-4)
+    assert live.marginal("a").diagonal() == pytest.approx(std**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("lag", [0, 8])
+def test_a_step_that_isam2_cannot_take_is_undone(lag, monkeypatch):
+    live, new = followed(lag=lag), {"x25": our_pose(TRUE[24])}
+    before, marginal = live["x24"], live.marginal("x24")
+    monkeypatch.setattr(Incremental, "_free", lambda *_: [])
+    with pytest.raises(co.InputError, match="Indeterminate"):
+        live.add([("range", ("x24", "x25"), 1.0, 0.1)], new)
+    assert live["x24"] == pytest.approx(before, abs=1e-6)
+    assert live.marginal("x24") == pytest.approx(marginal, rel=1e-3)
+    live.add([("relative_pose_log", ("x24", "x25"), our_pose(TRUE[1]), STD)], new)
+
+
 def test_robust_losses_are_those_of_a_solve():
     found = followed(Loss("huber", 1.0)).update()
     assert found.status.name == "SOLVED"
@@ -118,6 +138,11 @@ def test_what_is_refused_leaves_the_estimate_as_it_was():
         ([], {"x3": our_pose(TRUE[3])}, "values"),
         ([], {"l9": [1.0, 2.0, 3.0]}, "values"),
         ([("relative_pose", ("x24", "x25"), our_pose(TRUE[1]), [0.1, 0.2, 0.1])], new, "factors"),
+        ([("range", ("x24", "x25"), 1.0, 0.1)], new, "leave x25 free"),
+        ([], new, "leave x25 free"),
+        (5, {}, "factors = 5"),
+        ([("range", ("x24", "l0"))], {}, "tuples"),
+        ([], {7: [1.0, 0.0]}, "names of nodes"),
     ):
         with pytest.raises(co.InputError, match=field):
             live.add(factors, values)

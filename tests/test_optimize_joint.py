@@ -7,7 +7,7 @@ from conftest import refused
 from random_graphs import random_graph
 
 from coopoc.optimize import Problem, solve
-from coopoc.optimize.assess.assess import joint_covariance
+from coopoc.optimize.assess.assess import as_stated, joint_covariance
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.graph_problems import from_graph
 
@@ -18,7 +18,7 @@ def test_a_joint_covariance_is_a_part_of_the_inverse(dimension, steps):
     """Few nodes by a dense factor, many by a sparse one; a fixed node has none."""
     problem = from_graph(random_graph(1, dimension, steps=steps))
     found, dof = solve(problem), problem.space.dof
-    J = problem.whiten(found.x)[1].toarray()
+    J = as_stated(problem).whiten(found.x)[1].toarray()
     free = np.flatnonzero(problem.movable.ravel())
     inverse = np.zeros((J.shape[1], J.shape[1]))
     inverse[np.ix_(free, free)] = np.linalg.inv(J[:, free].T @ J[:, free])
@@ -50,6 +50,13 @@ def test_joint_marginals_are_gtsams():
     joint = joint_covariance(problem, found, keys)
     theirs = np.array([[whole.at(a, b) for b in keys] for a in keys])
     assert joint == pytest.approx(theirs, rel=1e-6, abs=1e-12)
+
+
+def test_a_point_on_the_line_of_its_anchors_has_the_covariance_of_its_solution():
+    between = Problem("vab", dimension=2, x0=[[4, 0.7], [0, 0], [10, 0]], fixed="ab")
+    between = between.add("range", [("v", "a"), ("v", "b")], [3.9, 5.8], std=0.1)
+    found = solve(between)
+    assert joint_covariance(between, found, "v")[0, 0] == pytest.approx(found.covariance[0], rel=1e-6)
 
 
 def test_what_has_no_covariance_is_refused():

@@ -12,6 +12,7 @@ from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
+from coopoc.optimize.assess.assess import as_stated
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.measurements import lookup
 from coopoc.optimize.model.space import Space, exp, log
@@ -57,16 +58,12 @@ def _relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
     return space.join(R[i].T @ (p[j] - p[i]), R[i].T @ R[j])
 
 
-def free(problem: Problem) -> np.ndarray:
-    return problem.movable
-
-
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     problem, truth = everything(dimension)
     found = solve(problem, backend)
-    space, movable = problem.space, free(problem).ravel().astype(bool)
+    space, movable = problem.space, problem.movable.ravel()
 
     def residual(step: np.ndarray) -> np.ndarray:
         whole = np.zeros(movable.size)
@@ -79,7 +76,7 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     step = np.zeros(movable.size)
     step[movable] = theirs.x
     assert found.x == pytest.approx(space.retract(truth, step.reshape(9, -1)), abs=1e-6)
-    J = problem.whiten(found.x)[1].toarray()[:, movable]
+    J = as_stated(problem).whiten(found.x)[1].toarray()[:, movable]
     cov = np.zeros((movable.size, movable.size))
     cov[np.ix_(movable, movable)] = np.linalg.inv(J.T @ J)
     own = cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)]
@@ -146,7 +143,10 @@ def test_wrong_input_says_what_to_do(case):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize(("kind", "of"), [("range", 30), ("bearing", 0), ("bearing", 30), ("body_spherical", 0)])
+@pytest.mark.parametrize(
+    ("kind", "of"),
+    [("range", 30), ("bearing", 0), ("bearing", 30), ("body_spherical", 0), ("spherical", 0), ("displacement", 30)],
+)
 def test_poses_without_an_x0_are_found(kind, of, d):
     """Headings are not given: odometry is turned to where fixes of poses, or what is measured of points with fixes, put
     it."""
@@ -157,7 +157,10 @@ def test_poses_without_an_x0_are_found(kind, of, d):
     problem = problem.add("relative_pose", [*pairwise(range(n))], moves, std=0.01)
     fixed = slice(of, None if of else n, 1 if of else 3)
     problem = problem.add("position", range(n + 4)[fixed], truth[fixed, :d], std=0.1)
-    seen = lookup(kind).predict(np.array([_relative(space, truth, pair)[:d] for pair in pairs]))
+    gap = np.array([_relative(space, truth, pair)[:d] for pair in pairs])
+    if lookup(kind).frame == "world":
+        gap = truth[n:, :d][np.arange(n) % 4] - truth[:n, :d]
+    seen = lookup(kind).predict(gap)
     solution = solve(problem.add(kind, pairs, seen, std=0.02))
     assert solution.x[:, :d] == pytest.approx(truth[:, :d], abs=1e-3)
 
@@ -207,6 +210,38 @@ def test_offsets_that_ranges_share_are_scipys(backend):
     std = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac))[-2:])
     assert np.sqrt(found.covariance[-2:, 0, 0]) == pytest.approx(std, rel=1e-4)
     assert (np.abs(found.x[-2:, 0] - [2.0, -0.4]) < 4 * std).all()
+
+
+def test_what_no_start_knows_is_drawn():
+    """Azimuths in the world place landmarks; without noise the truth costs nothing."""
+    rng, space = np.random.default_rng(38), Space(2, has_rotation=True)
+    h = np.cumsum(rng.normal(0, 0.3, 6))
+    at = np.cumsum(2 * np.exp(1j * h))
+    marks = at.mean() + rng.uniform(-8, 8, 3) + 1j * rng.uniform(-8, 8, 3)
+    x, steps = pose(np.c_[at.real, at.imag], h), [*pairwise(range(6))]
+    drive = Problem(range(9), dimension=2, poses=range(6)).add("pose", 0, x[0], std=0.05)
+    drive = drive.add("relative_pose", steps, [_relative(space, x, step) for step in steps], std=0.05)
+    pairs = [(k, 6 + j) for k in range(6) for j in range(3)]
+    found = solve(drive.add("azimuth", pairs, np.angle(marks - at[:, None]).ravel(), std=0.02))
+    assert found.cost < 1e-6
+    assert found.seconds >= found.extras["start_seconds"]
+    assert found.build_seconds < found.extras["start_seconds"]
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+def test_points_that_a_pose_sees_in_the_world_do_not_start_in_one_place(backend):
+    seen = Problem("pab", dimension=2, poses=(0,)).add("pose", 0, pose([0, 0], 0), std=0.1)
+    seen = seen.add("spherical", [(0, 1), (1, 2), (0, 2)], [[5.0, 0.3], [4.0, 1.2], [8.11, 0.697]], std=[0.1, 0.02])
+    assert solve(seen, backend).cost < 0.01
+
+
+def test_half_a_turn_is_told_from_places_that_coincide():
+    one = Problem("a", poses=(0,), x0=[pose([0, 0, 0], [0, 0, 0])]).add(
+        "pose", 0, pose([0, 0, 0], [0, np.pi, 0]), std=0.1
+    )
+    with refused("a half a turn from what is measured"):
+        solve(one)
+    assert solve(Problem("a", one.factors, poses=(0,))).cost < 1e-9
 
 
 def test_an_antenna_stands_at_the_end_of_its_arm():

@@ -13,7 +13,7 @@ from coopoc.optimize.convex import certify
 from coopoc.optimize.graph_problems import _counted
 
 
-def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float) -> Problem:
+def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float | Floats) -> Problem:
     """A robot that ranges anchors in the plane."""
     count = len(anchors)
     problem = Problem((*map(str, range(count)), "r"), x0=np.vstack([anchors, start]), fixed=range(count), dimension=2)
@@ -51,6 +51,21 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
         assert found.covariance[3] == pytest.approx(np.linalg.inv(np.array(hessian) / 4e-6), rel=1e-3)
 
 
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+@pytest.mark.parametrize("degrees", [0, 20, 45])
+def test_a_strict_minimum_is_one_wherever_the_axes_are(degrees, offset, backend):
+    """On the line of its anchors, of ranges that fit there alone: of one precision, and of 1 mm beside 0.5 m."""
+    turn = np.array([[c := np.cos(np.deg2rad(degrees)), s := np.sin(np.deg2rad(degrees))], [-s, c]])
+    for anchors, start, ranges, std in (
+        ([0, 10, 25], [4, 0.7], [3.9, 5.8, 20.75], 0.1),
+        ([0, 4.5], [9, 1e-3], [9.0, 3.7], np.array([[1e-3], [0.5]])),
+    ):
+        at = np.outer(anchors, [1.0, 0.0]) @ turn + offset
+        problem = ranged(at, np.array(start) @ turn + offset, np.array(ranges), std)
+        assert solve(problem, backend, throw=False).status is Status.SOLVED
+
+
 def test_a_saddle_between_two_anchors_is_one():
     """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line."""
     problem = ranged(np.array([[0, 0], [10, 0.0]]), np.array([5, 0.0]), np.full(2, 15.0), 1.0)
@@ -68,6 +83,11 @@ def test_a_certified_mirror_image_is_not_unique():
     fixed = pair.add("position", "r", [5, 5], std=1.0)
     verdict = certify(fixed, solve(fixed))
     assert (verdict.certified, verdict.unique) == (True, True)
+    free = Problem("abc", dimension=2, x0=[[0, 0], [3, 0], [3, 4]]).add("range", (0, 2), 5.2, std=0.1)
+    free = free.add("displacement", [(0, 1), (1, 2)], [[3.0, 0.1], [0.1, 4.0]], std=0.2)
+    verdict = certify(free, solve(free, throw=False))
+    assert (verdict.certified, verdict.unique) == (True, False)
+    assert "a motion of all" in str(verdict)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -102,6 +122,14 @@ def test_bounds_that_push_are_no_local_minimum():
     assert "3 bounds that push" in note
     assert "local minimum" not in note
     assert held(-1.0).expected == 0
+
+
+def test_a_convex_problem_has_no_local_minimum():
+    apart = Problem("ab", dimension=2).add("position", ["a", "b"], [[0, 0], [10, 0]], std=0.5)
+    apart = apart.constrain("displacement", ("a", "b"), lower=[4.0, 0], upper=[4.0, 0])
+    assert "explains 1 +- 1: constraints of displacement that contradict" in solve(apart).notes[-1]
+    free = Problem("abc", dimension=2).add("displacement", [(0, 1), (1, 2), (0, 2)], [[1, 0], [1, 0], [2.1, 0]], 0.1)
+    assert solve(free, throw=False).cost == pytest.approx(0.1**2 / 6 / 0.1**2)
 
 
 def test_what_is_said_of_many_lines_is_said_once():

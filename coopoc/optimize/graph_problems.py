@@ -28,7 +28,7 @@ from .starts.graph_starts import (
     separated,
     unwound,
 )
-from .starts.pose_starts import graph_of, placed
+from .starts.pose_starts import graph_of, placed, places_all
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
@@ -61,8 +61,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     chordal: kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2, tau = d / trace(cov_t) and kappa = 1 / var_theta
     in the plane, 3 / (2 trace(cov_R)) in space: quadratic, so that it can be certified. These are the weights of CORA
     (arXiv 2302.11614), and those of SE-Sync (Rosen et al., IJRR 2019) where heading and position are not correlated;
-    else SE-Sync's kappa is the information of theta, which is larger. geodesic: |log(T_ij^-1 T_i^-1 T_j)|^2 with the
-    full covariance.
+    else SE-Sync's kappa is the information of theta, which is larger. Covariances are those of the variances, not of
+    these weights. geodesic: R_ij^T (R_i^T (t_j - t_i) - t_ij) and log(R_ij^T R_i^T R_j) with the full covariance.
 
     Args:
         graph: of `coopoc.formats.load_graph`.
@@ -109,7 +109,11 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
 
 
 def _raced(
-    graph: Graph, problem: Problem, starts: Mapping[str, Callable[[], Floats]], unwound: Callable[[Floats], bool]
+    graph: Graph,
+    problem: Problem,
+    starts: Mapping[str, Callable[[], Floats]],
+    unwound: Callable[[Floats], bool],
+    draws: bool | None = False,
 ) -> tuple[Problem, Search]:
     """The race of what a graph offers; the problem starts at chained odometry."""
     late: dict[str, Any] = {}
@@ -119,7 +123,7 @@ def _raced(
         if len(graph.ranges):
             late["eased"] = partial(eased, start=np.asarray(problem.x0))
         late["incremental"] = lambda _: incremental_start(graph, problem)
-    return race(problem, starts, late, unwound, "incremental" if len(graph.ranges) else "")
+    return race(problem, starts, late, unwound, "incremental" if len(graph.ranges) else "", draws)
 
 
 def started(problem: Problem) -> Problem:
@@ -140,7 +144,7 @@ def started(problem: Problem) -> Problem:
         for k in range(1, PLACES if len(graph.ranges) else 1):
             starts[f"odometry, place {k + 1}"] = partial(placed, problem, own["odometry"], k)
         at = problem.replace_unchecked(x0=frozen(starts["odometry"]()))
-        at, won = _raced(graph, at, starts, lambda x: False)
+        at, won = _raced(graph, at, starts, lambda x: False, None if places_all(problem) else True)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

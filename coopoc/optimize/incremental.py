@@ -1,7 +1,7 @@
 """Live estimation: GTSAM's iSAM2 follows the measurements, and `solve` checks where it has led."""
 
 from collections import ChainMap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,17 +9,24 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, checked, instance, number
-from ..errors import InputError, require
+from ..errors import InputError, require, shown
+from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
+from .model.derivatives import linearise
 from .model.factor import Factor, fused, stacked, unchecked
-from .model.problem import Problem, index_of, indices, points, rows
+from .model.problem import Problem, index_of, indices, points, rows, several
 from .solution import Solution
 from .solve import solve
 from .starts.initial import initial_guess
 
-LOOSE = 100.0
-"""m, standard deviation of a prior that iSAM2 alone has on each new point, which one range leaves free; with less
-information GTSAM takes a pivot for zero."""
+LOOSE = 1e6
+"""m, standard deviation of a prior that iSAM2 alone has on each new point, which one range leaves free: so vague that
+measurements decide wherever the first guess was."""
+STEADY = 100.0
+"""m, that of another one, which a point has as long as measurements know it less than this in some direction, and less
+than a share ROUND of what they know in the best: it damps the steps that nearly parallel ranges would take."""
+ROUND = 1e-3
+"""Share of information."""
 
 
 class Incremental:
@@ -36,9 +43,9 @@ class Incremental:
 
     def __init__(self, problem: Problem, isam: Any, lag: int) -> None:
         self.names, self.isam, self._problem, self._factors = list(problem.names), isam, problem, list(problem.factors)
-        self.lag, self._steps = lag, 0
+        self.lag, self._steps, self._slots, self._steadied = lag, 0, 0, dict[int, tuple[int, Floats]]()
         self._place, self._poses = {name: k for k, name in enumerate(self.names)}, {*problem.poses}
-        self._step(problem, range(len(self.names)), 0, initial_guess(problem), which_turn(problem))
+        self._step(problem, range(len(self.names)), 0, initial_guess(problem), which_turn(problem), self.names)
 
     def add(
         self,
@@ -53,11 +60,14 @@ class Incremental:
             values: name -> (d,) m of a point, or `pose(...)` (ambient,) of a pose.
 
         Raises:
-            InputError: a name that is known already or unknown, a measurement that GTSAM has no factor for.
+            InputError: a name that is known already or unknown, a measurement that GTSAM has no factor for, a new pose
+                that nothing holds; the estimate is as before.
         """
         space, first, new = self._problem.space, len(self.names), dict(values or {})
         d, x, turns = space.dimension, np.zeros((len(new), space.ambient)), list[bool]()
         for k, (name, value) in enumerate(new.items()):
+            if not isinstance(name, str):
+                raise InputError("values", shown(name), "must have names of nodes", "Give a str.")
             if name in self._place:
                 raise InputError("values", repr(name), "must be a new node", "Give guesses of new nodes alone.")
             vector = checked("values", value).ravel()
@@ -75,8 +85,11 @@ class Incremental:
             return known_index if known_index >= first else self._index(known_index)
 
         made = list[Factor]()
-        for each in factors:
+        for each in several(factors):
             if not isinstance(each, Factor):
+                if isinstance(each, str) or not isinstance(each, Sequence) or not 3 <= len(each) <= 4:
+                    allowed = "must be Factors, or tuples (kind, nodes, z, std)"
+                    raise InputError("factors", shown(each), allowed, 'Give [("range", ("x7", "dock"), 4.2, 0.1)].')
                 kind, nodes, z, *std = each
                 at = indices(index, kind, nodes)
                 each = Factor(kind, at, rows(kind, z, len(at)), *std)
@@ -88,31 +101,122 @@ class Incremental:
         local = [unchecked(f, nodes=np.searchsorted(used, f.nodes)) for f in made]
         part = Problem(tuple(names), local, dimension=d, poses=tuple(poses))
         part.__dict__["space"] = space
-        self._step(part, used, first, x, turns)
+        self._step(part, used, first, x, turns, every)
         self._poses |= late_poses
         self._place.update(fresh)
         self.names = every
         self._factors += made
 
-    def _step(self, part: Problem, keys: Sequence[int], first: int, x: Floats, turns: Sequence[bool]) -> None:
+    def _step(
+        self,
+        part: Problem,
+        keys: Sequence[int],
+        first: int,
+        x: Floats,
+        turns: Sequence[bool],
+        names: Sequence[str],
+    ) -> None:
         """iSAM2's step with the factors of a problem, whose nodes have these keys, and new nodes from `first` on."""
         import gtsam
 
-        parts, d = forms(part), part.dimension
-        for factor, form in zip(part.factors, parts, strict=True):
+        stated, d = forms(part), part.dimension
+        for factor, form in zip(part.factors, stated, strict=True):
             if form is None:
                 hint = "relative_pose_log takes any covariance and loss; solve() takes all."
                 raise InputError("factors", repr(factor), "must be one that GTSAM has a factor for", hint)
-        graph, guess = graph_of(part, parts, keys), values(part.space, turns, x, first)
-        loose = gtsam.noiseModel.Isotropic.Sigma(d, LOOSE)
-        for k in np.flatnonzero(~np.array(turns, dtype=bool)).tolist():
-            graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](first + k, x[k, :d], loose))
+        if free := self._free(part, keys, first, x, turns):
+            lost = ", ".join(names[k] for k in free[:5])
+            raise InputError("factors", f"leave {lost} free", "must hold every new pose", "Add a relative pose.")
+        graph, guess = graph_of(part, stated, keys), values(part.space, turns, x, first)
+        new = {first + int(k) for k in np.flatnonzero(~np.array(turns, dtype=bool))}
+        told, spent = self._told(part, keys, first, x, new), list[int]()
+        late = list[int]()
+        for k, information in told.items():
+            least, *_, most = np.linalg.eigvalsh(information).tolist()
+            if least > min(STEADY**-2, ROUND * most):
+                spent += [self._steadied[k][0]] if k in self._steadied else []
+            elif k in new:
+                late.append(k)
+        for std, eased in ((LOOSE, sorted(new)), (STEADY, late)):
+            for k in eased:
+                noise = gtsam.noiseModel.Isotropic.Sigma(d, std)
+                graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](k, x[k - first, :d], noise))
+        used = [dict.fromkeys([*keys, *guess.keys()], float(self._steps))] if self.lag else []
+        count = self._graph().size() if self.lag else self._slots  # of iSAM2 alone a copy of all factors
+        try:
+            result = self.isam.update(graph, guess, *used, *([spent] if spent else []))
+        except RuntimeError as error:
+            self._restore(count, range(first, first + len(x)))
+            said = shown(" ".join(str(error).split()), 200)
+            raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
+        result = self.isam.getISAM2Result() if self.lag else result
+        slots = dict(zip(late, [*result.getNewFactorsIndices()][-len(late) :], strict=True)) if late else {}
+        for k, information in told.items():
+            slot = self._steadied.pop(k, (slots.get(k), None))[0]
+            if slot is not None and slot not in spent:
+                self._steadied[k] = slot, information
+        self._steps, self._slots = self._steps + 1, count + graph.size()
+
+    def _told(
+        self, part: Problem, keys: Sequence[int], first: int, x: Floats, new: Collection[int]
+    ) -> dict[int, Floats]:
+        """(d, d) information about new points and those that are still steadied, given all other nodes."""
+        d = part.dimension
+        told: dict[int, Floats] = {k: np.zeros((d, d)) for k in new}
+        told |= {k: self._steadied[k][1].copy() for k in keys if k in self._steadied}
+        if told and part.factors:
+            linear = linearise(part.space, part.factors, None, self._at(part, keys, first, x))
+            for factor, jacobians in zip(part.factors, linear.jacobian, strict=True):
+                for nodes, J in zip(factor.nodes.T.tolist(), jacobians, strict=True):
+                    for k, own in zip(nodes, J[:, :, :d], strict=True):
+                        if keys[k] in told:
+                            told[keys[k]] += own.T @ own
+        return told
+
+    def _at(self, part: Problem, keys: Sequence[int], first: int, x: Floats) -> Floats:
+        """(n, ambient) the nodes of a step, new ones where they are guessed."""
+        at = [x[k - first] if k >= first else self[int(k)] for k in keys]
+        return np.array(at).reshape(len(keys), part.space.ambient)
+
+    def _graph(self) -> Any:
+        return self.isam.getFactors() if self.lag else self.isam.getFactorsUnsafe()
+
+    def _restore(self, count: int, new: Iterable[int]) -> None:
+        """iSAM2 anew from its first `count` factors and without new nodes: a step that failed has left it between."""
+        import gtsam
+
+        graph, old, guess = gtsam.NonlinearFactorGraph(), self._graph(), gtsam.Values(self.isam.getLinearizationPoint())
+        kept = [k for k in range(count) if old.exists(k)]
+        self._slots = len(kept)
+        for k in kept:
+            graph.add(old.at(k))
+        self._steadied = {key: (kept.index(k), told) for key, (k, told) in self._steadied.items() if k in kept}
+        for key in filter(guess.exists, new):
+            guess.erase(key)
+        params, used = self.isam.params(), list[Any]()
         if self.lag:
-            now = float(self._steps)
-            self.isam.update(graph, guess, {**dict.fromkeys(keys, now), **dict.fromkeys(guess.keys(), now)})
-        else:
-            self.isam.update(graph, guess)
-        self._steps += 1
+            used = [{key: at for key, at in self.isam.timestamps().items() if guess.exists(key)}]
+        self.isam = gtsam.IncrementalFixedLagSmoother(self.lag, params) if self.lag else gtsam.ISAM2(params)
+        self.isam.update(graph, guess, *used)
+
+    def _free(self, part: Problem, keys: Sequence[int], first: int, x: Floats, turns: Sequence[bool]) -> list[int]:
+        """New poses that the factors of a step leave free where older nodes are known, and new points to LOOSE: only
+        of those that no whole relative poses hold the null space is looked at."""
+        d, older = part.dimension, [k for k, key in enumerate(keys) if key < first]
+        held = {*older, *part.fixed}
+        for factor in part.factors:
+            if factor.measurement.compares_poses:
+                for nodes in factor.nodes[factor.measured == factor.size].tolist():
+                    held.update(nodes if len(nodes) == 1 or not held.isdisjoint(nodes) else [])
+        loose = {first + k for k, turned in enumerate(turns) if turned} - {keys[k] for k in held}
+        if loose:
+            at = self._at(part, keys, first, x)
+            points = np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
+            vague = [Factor("position", points[:, None], at[points, :d], std=np.full(d, LOOSE))] if len(points) else []
+            known = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
+            free = [keys[part.index(name)] for name in assess(known, at, covariance=False).unobservable]
+            loose &= {*free} | (loose - {*keys})
+        return sorted(loose)
 
     def __contains__(self, node: str) -> bool:
         return node in self._place
@@ -210,6 +314,7 @@ def incremental(
     number("wildfireThreshold", wildfireThreshold, 0.0, allowed="a number >= 0", hint="GTSAM's own is 1e-3.")
     params.setRelinearizeThreshold(relinearizeThreshold)
     params.relinearizeSkip = relinearizeSkip
+    params.setFactorization("QR")  # takes no small pivot for zero
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfireThreshold))
     number("lag", lag, 0, kind=int, allowed="a whole number >= 0", hint="0 forgets nothing.")
     return Incremental(problem, gtsam.IncrementalFixedLagSmoother(lag, params) if lag else gtsam.ISAM2(params), lag)

@@ -9,17 +9,16 @@ import numpy as np
 from ..arrays import Floats, instance
 from ..errors import InputError, MissingLibraryError
 from ..kernels.compiling.waiting import clock, load, spent
-from .algebra.sparse import LIBRARIES, sparse
+from .algebra.sparse import LIBRARIES
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, require_backend
 from .graph_problems import started
-from .model.derivatives import linearise
-from .model.factor import as_factor, bounded, fused
+from .model.factor import fused
 from .model.measurements import CONVERTED
 from .model.problem import Problem
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
-from .starts.initial import guessed, somewhere
+from .starts.initial import directed, guessed, somewhere, undirected
 from .starts.mirrors import scaled
 from .starts.race import ELSEWHERE, race
 
@@ -95,7 +94,7 @@ def _chosen(problem: Problem) -> Backend:
 def _solved(problem: Problem, backend: Backend, options: Options, covariance: bool) -> Solution:
     """The result of a backend, and its assessment."""
     load(*LIBRARIES)
-    began = clock()
+    began, earlier = clock(), problem.search.seconds
     solver, problem = backend.solver(problem, options), started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
@@ -103,7 +102,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem = _searched(problem, start)
         assert problem.x0 is not None
         start = problem.x0
-    built, earlier = clock(), problem.search.seconds
+    built, searched = clock(), problem.search.seconds
     if any(f.loss is not None and (not f.loss.convex or problem.x0 is None) for f in problem.factors):
         problem = robust_start(problem, start)
         assert problem.x0 is not None
@@ -126,8 +125,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         gradient_norm=truth.gradient_norm,
         status=status,
         iterations=iterations + search.iterations,
-        build_seconds=built - began,
-        solve_seconds=solved - built + earlier,
+        build_seconds=built - began - (searched - earlier),
+        solve_seconds=solved - built + searched,
         check_seconds=clock() - solved,
         load_seconds=spent["load"],
         compile_seconds=spent["compile"],
@@ -164,22 +163,15 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
     if problem.linear and not problem.constraints:
         return somewhere(problem), True
     start, placed = guessed(problem)
-    if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
-        return start, placed
-    items = *problem.factors, *map(as_factor, problem.constraints)
-    counts = [*(np.array(True) for _ in problem.factors), *map(bounded, problem.constraints)]
-    with np.errstate(all="ignore"):
-        linear = linearise(problem.space, items, problem.movable, start)
-    for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
-        bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
-        if bad.any():
-            pair = " and ".join(problem.names[n] for n in item.nodes[bad.argmax()])
-            raise InputError(
-                "x0",
-                f"{pair} coincide or stand above each other",
-                f"leave {item.kind} without a direction",
-                "Give an x0 that keeps them apart.",
-            )
+    if problem.x0 is None:
+        start = directed(problem, start)
+    for item, nodes in undirected(problem, start):
+        pair = " and ".join(problem.names[n] for n in nodes[0])
+        if item.measurement.compares_poses:
+            what, hint = f"{pair} half a turn from what is measured", "Give an x0 that is turned less."
+        else:
+            what, hint = f"{pair} coincide or stand above each other", "Give an x0 that keeps them apart."
+        raise InputError("x0", what, f"leaves {item.kind} without a direction", hint)
     return start, placed
 
 

@@ -1,10 +1,23 @@
 """Sparse Cholesky factors of a Hessian with their analysis kept: solve, definiteness, marginals of any unknowns."""
 
+from contextlib import nullcontext
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+
+ALONE = 64
+"""Rows from which BLAS would share so small a matrix among threads, which wait for one another far longer."""
+
+
+@cache
+def _blas() -> Any:
+    """What limits the threads of BLAS, found once."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
 
 
 class Cholesky:
@@ -80,13 +93,15 @@ class DenseCholesky:
 
         self._dpotrf, self._dpotri, self._dpotrs = dpotrf, dpotri, dpotrs
         self._size = len(indptr) - 1
+        self._alone = partial(_blas().limit, limits=1) if self._size > ALONE else nullcontext
         self._place = np.asarray(indices) + self._size * np.repeat(np.arange(self._size), np.diff(indptr))
 
     def factor(self, values: Floats) -> bool:
         """Factor an upper triangle's values; whether it is positive definite."""
         matrix = np.zeros(self._size**2)
         matrix[self._place] = values
-        self._root, info = self._dpotrf(matrix.reshape(self._size, -1).T, clean=0, overwrite_a=1)
+        with self._alone():
+            self._root, info = self._dpotrf(matrix.reshape(self._size, -1).T, clean=0, overwrite_a=1)
         return bool(info == 0)
 
     @property
@@ -96,11 +111,13 @@ class DenseCholesky:
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        return np.asarray(self._dpotrs(self._root, rhs)[0])
+        with self._alone():
+            return np.asarray(self._dpotrs(self._root, rhs)[0])
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
         """A^-1 at pairs of unknowns (K,)."""
-        whole = self._dpotri(self._root)[0]
+        with self._alone():
+            whole = self._dpotri(self._root)[0]
         return np.asarray(whole[np.minimum(rows, columns), np.maximum(rows, columns)])
 
 

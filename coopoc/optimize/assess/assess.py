@@ -11,7 +11,7 @@ from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
 from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
-from ..model.derivatives import linearise, numbers_of
+from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, unchecked
 from ..model.problem import Problem, several
 from .active import Active, active_at
@@ -19,6 +19,8 @@ from .active import Active, active_at
 if TYPE_CHECKING:
     from ..solution import Solution
 
+CHORDAL = "pose_chordal", "relative_pose_chordal"
+"""Kinds that compare the entries of rotation matrices."""
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
 CANCELLED = 1e-7
@@ -28,8 +30,10 @@ SMALL = 200
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
 rounding."""
-REST = 1e-6
-"""m or rad, a step within which a point is stationary."""
+FLAT = 1e-9
+"""Curvature, as a share of the diagonal of J^T J, that is rounding."""
+LEVER = 0.1
+"""m or rad, least radius of a way along which no measurement changes."""
 TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
 MANY = 0.25
@@ -86,6 +90,9 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     still = ~problem.movable
     try:
         cov, dx, sound = _marginals(with_still(J.T @ J, still), gradient, shape, active)
+        if (stated := as_stated(problem)) is not problem:
+            J_stated = stated.jacobian(stated.linearise(x))
+            cov = _marginals(with_still(J_stated.T @ J_stated, still), gradient, shape, active)[0]
     except np.linalg.LinAlgError:
         sound = False
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
@@ -112,43 +119,47 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
         far = float(np.abs(dx).max(initial=0.0))
         return Assessment(cost, size, cov, far, predicted=0.5 * abs(float(gradient @ dx)), curved=curved)
 
-    own, cov = _largest(problem, entries, values), none
+    own, cov = _largest(problem, entries, values[entries.diagonal]), none
     step = variance = np.full(entries.size, np.inf)
     if held := cholesky.factor(values):
         step, variance = cholesky.solve(gradient), 1.0 / cholesky.pivots
         if covariance or not (variance * own < INFLATION).all():
-            cov, variance = _inverse(system)
+            cov, variance = _inverse(problem, x, "gauss-newton")
         if (variance * own < INFLATION).all():
             return ended(cov, step)
-    eased, exact = values.copy(), None
-    eased[entries.diagonal] += SLACK * own + (own == 0)
-    calm = cholesky.solve(gradient) if cholesky.factor(eased) else step
-    if not problem.linear and np.abs(calm).max(initial=0.0) <= REST:
-        exact = system.quadratic(x, "newton")[2]
-    bent = None if exact is None else (_symmetric(entries, exact), np.sqrt(own + (own == 0)))
+    exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
+    if not problem.linear and np.isfinite(exact).all():
+        scale, slope = own + (own == 0), _largest(problem, entries, np.abs(gradient))
+        flat = FLAT + (slope / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
+        bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return replace(unknown, unobservable=nodes)
-    if exact is None:
+    if bent is None:
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):
-        return ended(none, calm, True)
-    inverse, less = _inverse(system)
-    return ended(inverse, cholesky.solve(gradient), True) if (2.0 * less < variance).any() else ended(cov, step)
+        values[entries.diagonal] += SLACK * own + (own == 0)
+        return ended(none, cholesky.solve(gradient) if cholesky.factor(values) else step, True)
+    newton = cholesky.solve(gradient)
+    inverse, less = _inverse(problem, x, "newton")
+    return ended(inverse, newton, True) if (2.0 * less < variance).any() else ended(cov, step)
 
 
-def _largest(problem: Problem, entries: Entries, values: Floats) -> Floats:
-    """(m,) the largest entry on the diagonal among the positions, or the turns, of the node of each unknown."""
+def _largest(problem: Problem, entries: Entries, numbers: Floats) -> Floats:
+    """(m,) the largest of such numbers among the positions, or the turns, of the node of each unknown."""
     number, d = entries.number, problem.dimension
-    table = np.append(values[entries.diagonal], 0.0)[number]
+    table = np.append(numbers, 0.0)[number]
     for part in (table[:, :d], table[:, d:]):
         part[:] = part.max(axis=1, initial=0.0, keepdims=True)
     return table[number >= 0]
 
 
-def _inverse(system: Sparse) -> tuple[Floats, Floats]:
-    """Marginals (n, dof, dof) by the factor that is at hand, and their diagonal (m,)."""
+def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]:
+    """Marginals (n, dof, dof) under the noise that is stated, and their diagonal (m,); the cost's factor is at hand."""
+    system, stated = sparse(problem), as_stated(problem)
     free, rows, columns = system.entries.own
-    blocks, cov = system.cholesky.inverse(rows, columns), np.zeros(free.shape)
+    blocks, cov = np.full(len(rows), np.nan), np.zeros(free.shape)
+    if stated is problem or system.cholesky.factor(sparse(stated).quadratic(x, model)[2]):
+        blocks = system.cholesky.inverse(rows, columns)
     cov[free] = blocks
     return cov, blocks[rows == columns]
 
@@ -196,13 +207,14 @@ def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats
 
 
 def _unobservable(
-    problem: Problem, J: Any, active: Active | None, bent: tuple[Any, Floats] | None = None
+    problem: Problem, J: Any, active: Active | None, bent: tuple[Any, Floats, Floats] | None = None
 ) -> tuple[str, ...]:
     """Nodes that take part in a direction which no measurement sees: the null space of J with unit columns.
 
-    Where `bent` has the exact Hessian H (m, m) at a stationary point and scales D^1/2 (m,) of the unknowns, only along
-    which D^-1/2 H D^-1/2 is flat, too: between two anchors that are too close together, a node is held across their
-    line by the curvature of ranges that are too short, and pushed off it by longer ones.
+    Where `bent` has the exact Hessian H (m, m), scales D^1/2 (m,) of the unknowns and shares (m,), only along which
+    D^-1/2 H D^-1/2 is no larger than its share, too: between two anchors that are too close together, a node is held
+    across their line by the curvature of ranges that are too short, and pushed off it by longer ones. A gradient bends
+    a direction that nothing sees by as much as its share: along a circle about an anchor by |g| / radius.
     """
     from scipy.sparse import eye_array
 
@@ -216,7 +228,7 @@ def _unobservable(
         moves = np.square(null).sum(axis=0) + ways[:, ~measured].power(2).sum(axis=1)
         moves = moves * problem.movable.ravel()
     else:
-        hessian, scale = bent
+        hessian, scale, flat = bent
         moving = np.flatnonzero(problem.movable)
         lost, curved = ~measured[moving], abs(hessian).sum(axis=0) > 0
         every = np.zeros((J.shape[1], len(null)))
@@ -225,7 +237,8 @@ def _unobservable(
         basis = np.linalg.qr(np.hstack([scale[:, None] * every[moving], own]))[0]
         values, turned = np.linalg.eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
         moves = np.zeros(J.shape[1])
-        moves[moving] = np.square(basis @ turned[:, np.abs(values) <= SLACK]).sum(axis=1) + (lost & ~curved)
+        ways_squared = np.square(basis @ turned)
+        moves[moving] = ways_squared[:, np.abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
     moves = moves.reshape(len(problem.names), -1).sum(axis=1)
     return tuple(compress(problem.names, moves > 1e-6))
 
@@ -354,19 +367,22 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
         beyond = np.asarray(factor.loss.weight(square)) < INLIER_WEIGHT
         count = int(beyond.sum())
         spent += 0.5 * float(factor.loss.cost(square[beyond]).sum())
-        out += factor.size * count
         if count:
             rejected.append((f"{factor.loss.name} loss", count, len(square), f"measurements {factor.kind}"))
+            out += int(factor.measured[beyond].sum())
     mean, variance = expected(problem, unknowns + out)
     notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
     most, spread = expected(problem, out) if pushing else (mean, variance)
     if implausible(truth.cost - spent, most, spread):
-        why = "a local minimum (try other x0, or certify it)"
+        convex = problem.linear and all(c.measurement.linear for c in problem.constraints)
+        whys = [] if convex or pushing else ["a local minimum (try other x0, or certify it)"]
         if pushing:
-            why = f"{pushing} bounds that push contradict the measurements"
+            whys += [f"{pushing} bounds that push contradict the measurements"]
+        elif equal := sorted({c.kind for c in problem.constraints if (c.lower == c.upper).any()}):
+            whys += [f"constraints of {', '.join(equal)} that contradict the measurements"]
+        why = ", ".join([*whys, "outliers, or noise that is stated too small"])
         notes.append(
-            f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: "
-            f"{why}, outliers, or noise that is stated too small"
+            f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: {why}"
         )
     return mean + spent, tuple(notes)
 
@@ -380,6 +396,17 @@ def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float
     loud = "DOUBTFUL: " if out >= MANY * of else ""
     rest = f"the rest costs {cost:.4g} where the stated noise explains {mean:.3g}"
     return f"{loud}{what} rejects {out} of {of} {which}; {rest}"
+
+
+def as_stated(problem: Problem) -> Problem:
+    """The problem with the weights of the noise that it states, of the same structure: in the plane
+    kappa |R_j - R_i R_ij|_F^2 with CORA's kappa = 1 / var_theta weighs the angle twice as much."""
+    d = problem.dimension
+    if d == 3 or not any(f.kind in CHORDAL for f in problem.factors):
+        return problem
+    share = np.sqrt([1.0] * d + [0.5] * d * d)
+    factors = (reweighed(f, share) if f.kind in CHORDAL else f for f in problem.factors)
+    return problem.replace_unchecked(factors=tuple(factors))
 
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
@@ -406,17 +433,23 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     matrix count as the angles that they hold; in the plane kappa |R_j - R_i R_ij|_F^2 is twice the square of the
     angle's error over its variance, and adds 1 and 2.
     """
-    d, angles = problem.dimension, problem.space.angles
-    counts = [(f, int(np.count_nonzero(f.informative))) for f in problem.factors]
-    matrices = sum(count for f, count in counts if f.kind in ("pose_chordal", "relative_pose_chordal"))
-    spare = sum(f.size * count for f, count in counts) - (d * d - angles) * matrices - unknowns
+    d, angles, count, matrices = problem.dimension, problem.space.angles, 0, 0
+    for factor in problem.factors:
+        measured = factor.measured
+        if factor.kind in CHORDAL:
+            turned = np.count_nonzero(factor.root[:, :, d:].any(axis=1), axis=1)
+            measured = measured - np.maximum(turned - angles, 0)
+            matrices += int(np.count_nonzero(turned))
+        count += int(measured.sum())
+    spare = count - unknowns
     turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices and d == 2 else 0
     mean = 0.5 * (max(spare, 0) + max(turns, 0))
     return mean, mean + max(turns, 0)
 
 
 def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str | int]) -> Floats:
-    """Covariance of some nodes together: their rows and columns of (J^T J)^-1 at the solution.
+    """Covariance of some nodes together: their rows and columns of (J^T J)^-1, or of the inverse of
+    the exact Hessian where `Solution.covariance` is that, at the solution.
 
     Two nodes of it give the covariance of their difference, which their marginals do not: P_ii + P_jj - P_ij - P_ji.
 
@@ -447,8 +480,10 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     if len(places) > len(problem.names):
         allowed = f"must name each of {len(problem.names)} nodes once"
         raise InputError("nodes", f"{len(places)} nodes", allowed, "Leave out those that stand twice.")
-    dof, system = problem.space.dof, sparse(problem)
-    if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
+    dof, system = problem.space.dof, sparse(as_stated(problem))
+    truth = assess(problem, x, covariance=False)
+    model: Model = "newton" if truth.curved else "gauss-newton"
+    if truth.unobservable or not system.cholesky.factor(system.quadratic(x, model)[2]):
         hint = "Measure what is free: see solution.unobservable."
         raise InputError("problem", repr(problem), "must hold all nodes", hint)
     wanted = system.entries.number[places].ravel()

@@ -1,5 +1,7 @@
 """gauss-newton: the reference. Levenberg-Marquardt with sparse Cholesky factors."""
 
+import numpy as np
+
 from ...arrays import Floats
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult
@@ -18,6 +20,8 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         end = arrive(sparse(problem), x, min(1, max_iterations) if problem.linear else max_iterations, tolerance)
+        if problem.linear and np.isnan(end.record).any():  # what is free needs damping
+            end = arrive(sparse(problem), x, max_iterations, tolerance)
         return SolverResult(end.x, end.iterations, extras={"record": end.record})
 
     return solver

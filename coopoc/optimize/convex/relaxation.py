@@ -152,8 +152,8 @@ class Certificate:
         cost: of the solution.
         lower_bound: no point has a smaller cost.
         smallest_eigenvalue: of C - L.
-        unique: no other point costs as little, up to a motion of all: 2 gap / lambda_{d + 1} of C - L bounds the sum of
-            squares by which unit vectors and rotations of such a point leave the span of the solution's.
+        unique: no other point costs as little: no node can move freely, and 2 gap / lambda_{d + 1} of C - L bounds the
+            sum of squares by which unit vectors and rotations of such a point leave the span of the solution's.
     """
 
     certified: bool
@@ -204,8 +204,10 @@ def certify(problem: Problem, solution: Solution) -> Certificate:
     gap, smallest = solution.cost - bound, float(values[0])
     certified = gap <= GAP * max(solution.cost, 1.0)
     framed = form.stiefel.size and len(values) > form.columns
-    unique = certified and bool(framed and 2.0 * max(gap, 0.0) < ALIKE * values[-1])
-    other = "no other point costs as little" if unique else "another, such as a mirror image, may cost as little"
+    alone = certified and bool(framed and 2.0 * max(gap, 0.0) < ALIKE * values[-1])
+    unique = alone and not solution.unobservable
+    image = "a motion of all, costs" if alone else "a mirror image, may cost"
+    other = "no other point costs as little" if unique else f"another, such as {image} as little"
     sentence = (
         f"certified global optimum of {problem!r}, and {other}"
         if certified

@@ -83,10 +83,12 @@ def arrive(
     Where that is not positive definite J^T J takes over for some steps. mu is the multiplier of a trust region
     |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps are
     `bounded`, J^T J stays, and the last step is one below the tolerance. A `smooth` descent ends with the first step
-    whose gain ratio is not within 1/2 .. 3/2.
+    whose gain ratio is not within 1/2 .. 3/2. An undamped step that raises the cost is taken with the next one where
+    both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines.
 
     References:
-        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
+        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3;
+        Chamberlain et al., The watchdog technique, 1982.
     """
     mu, against, cholesky = 0.0, 0, system.cholesky
 
@@ -131,6 +133,13 @@ def arrive(
             record.append((cost, mu, gain))
             converged = (hidden and small) or (not bounded and (predicted <= ROUNDED * max(cost, 1.0) or still > STILL))
             if not gain > 0.0:
+                corrected = None if mu or smooth or bounded or model == "newton" else _corrected(system, there)
+                kept = -np.inf if corrected is None else (cost - system.cost(corrected)) / predicted
+                if corrected is not None and kept > 1.0 - MISMATCH:
+                    record.append((after, mu, kept))
+                    x = corrected
+                    cost, gradient, values = undamped = system.quadratic(x, model)
+                    continue
                 mu = _grown(mu)
                 if smooth:
                     break
@@ -149,6 +158,12 @@ def arrive(
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
                 undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3))
+
+
+def _corrected(system: Sparse, x: Floats) -> Floats | None:
+    """x after a Gauss-Newton step."""
+    _, gradient, values = system.quadratic(x, "gauss-newton")
+    return system.retract(x, -system.cholesky.solve(gradient)) if system.cholesky.factor(values) else None
 
 
 def _grown(mu: float) -> float:

@@ -1,14 +1,21 @@
 """Where to start: the linear least-squares solution of the converted measurements."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..algebra.sparse import sparse
-from ..model.factor import Factor, unchecked
+from ..model.derivatives import linearise
+from ..model.factor import Factor, as_factor, bounded, unchecked
 from ..model.measurements import CONVERTED, converted_rows
 from ..model.problem import Problem
 
+TRIES = 5
+"""Of random moves."""
+NUDGE = 0.1
+"""m or rad, standard deviation of such a move."""
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
 
@@ -28,13 +35,54 @@ def guessed(problem: Problem) -> tuple[Floats, bool]:
         return problem.x0.copy(), True
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give coopoc.optimize.pose(position, angle).")
-    system, zero = sparse(problem), np.zeros((len(problem.names), problem.dimension))
-    _, gradient, values = system.quadratic(zero, "converted")
+    x, touched = _converted(problem, np.zeros((len(problem.names), problem.dimension)))
+    return (x if touched else _apart(problem, x)), touched
+
+
+def _converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
+    """Points (n, d) where vectors put them, from any x, and whether these touch all that can move."""
+    system = sparse(problem)
+    _, gradient, values = system.quadratic(x, "converted")
     own = values[system.entries.diagonal]
     values[system.entries.diagonal] = own + RIDGE
     system.cholesky.factor(values)
-    x, touched = system.retract(zero, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
-    return (x if touched else _apart(problem, x)), touched
+    return system.retract(x, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
+
+
+def by_vectors(problem: Problem, x: Floats, still: Ints, vectors: Sequence[Factor]) -> Floats:
+    """Nodes x (n, ambient), all but the `still` ones moved to where vectors between them put them."""
+    d, moved = problem.dimension, x.copy()
+    part = Problem(problem.names, vectors, x[:, :d], dimension=d, fixed=tuple(still.tolist()))
+    moved[:, :d] = _converted(part, x[:, :d])[0]
+    return moved
+
+
+def directed(problem: Problem, x: Floats) -> Floats:
+    """Nodes x (n, ambient) with those moved at random at which a measurement has no derivative."""
+    rng, movable = np.random.default_rng(0), problem.movable
+    for _ in range(TRIES):
+        lost = [nodes for _, nodes in undirected(problem, x)]
+        if not lost:
+            break
+        step = np.zeros(movable.shape)
+        nodes = np.unique(np.concatenate(lost))
+        step[nodes] = NUDGE * rng.normal(size=(len(nodes), movable.shape[1]))
+        x = problem.space.retract(x, step * movable)
+    return x
+
+
+def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
+    """Measurements and bounds without a derivative at x (n, ambient), and the nodes (K, arity) of such rows."""
+    if not problem.constraints and np.isfinite(sparse(problem).quadratic(x, "gauss-newton")[1]).all():
+        return []
+    items = *problem.factors, *map(as_factor, problem.constraints)
+    counts = [*(np.array(True) for _ in problem.factors), *map(bounded, problem.constraints)]
+    with np.errstate(all="ignore"):
+        linear, found = linearise(problem.space, items, problem.movable, x), list[tuple[Factor, Ints]]()
+    for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
+        bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
+        found += [(item, item.nodes[bad])] if bad.any() else []
+    return found
 
 
 def somewhere(problem: Problem) -> Floats:

@@ -10,10 +10,11 @@ from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
 from ...world.links import wrap
 from ..model.factor import Factor, fused, stacked, taken
+from ..model.measurements import CONVERTED
 from ..model.problem import Problem
 from ..model.space import Space, exp
 from .graph_starts import parts, trilaterate, walk, with_points
-from .initial import as_vectors, initial_guess
+from .initial import as_vectors, by_vectors, directed, initial_guess
 from .mirrors import ranges_of
 
 FIELDS = {
@@ -35,6 +36,8 @@ LARGEST = 1e100
 """Standard deviations, whose square is a number."""
 APART = 0.1
 """Share of the size of a body by which places of it differ."""
+PLACING = {*FIELDS, "bearing", "displacement", CONVERTED}
+"""Kinds by which a start places nodes; where there are others, nodes are drawn, too."""
 LEVER = 1e-2
 """1/m^2 beside directions of length 1: a point of which there are no more bearings lies a few metres ahead."""
 
@@ -78,8 +81,17 @@ def along_poses(problem: Problem) -> Floats:
     return with_points(graph, position, rotation, placed)[:, : space.ambient]
 
 
+def places_all(problem: Problem) -> bool:
+    """Whether a start knows all kinds of a problem."""
+    return all(_plain(factor) in PLACING for factor in problem.factors)
+
+
+def _plain(factor: Factor) -> str:
+    return factor.kind.removesuffix("_chordal").removesuffix("_log")
+
+
 def _field(factor: Factor) -> str:
-    return FIELDS.get(factor.kind.removesuffix("_chordal").removesuffix("_log"), "")
+    return FIELDS.get(_plain(factor), "")
 
 
 def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
@@ -97,7 +109,8 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
 
 def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
     """Nodes x (n, ambient) with each body, which relative measurements hold together, turned and moved to where its
-    fixes, and its ranges to and bearings of what is placed, fit best: those with most fixes first, then most ranges.
+    fixes, and vectors, ranges and bearings between it and what is placed, fit best: those with most fixes first, then
+    most ranges. The fix of an antenna is one of its pose, and a vector from what is placed is a fix.
 
     A body with a measured pose stays, and so does the first where nothing is placed. At last points go where bearings
     from poses cross. Of the places that ranges allow that of `rank` is taken, 0 the best.
@@ -105,24 +118,39 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
     d, space, x = problem.dimension, problem.space, x.copy()
     joined = [f.nodes[f.informative] for f in problem.factors if _field(f).startswith("relative")]
     part, ranges = parts(len(x), *joined), ranges_of(problem, x)
-    fixes = [taken(f, np.flatnonzero(f.informative)) for f in problem.factors if f.kind == "position"]
-    fixed, fix = stacked(f.nodes[:, 0] for f in fixes), stacked((f.z for f in fixes), d)
-    weight = stacked(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in fixes)
+    fixes, vectors = (
+        [taken(f, np.flatnonzero(f.informative)) for f in problem.factors if f.kind in kinds]
+        for kinds in (("position", "antenna"), ("displacement", CONVERTED))
+    )
+    vectors = [as_vectors(f) if f.kind == CONVERTED else f for f in vectors]
+    ends, vector = stacked((f.nodes for f in vectors), 2), stacked((f.z for f in vectors), d)
+    own_fixed, own_fix = stacked(f.nodes[:, 0] for f in fixes), stacked((f.z for f in fixes), d)
+    own_weight, vector_weight = (
+        stacked(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in factors) for factors in (fixes, vectors)
+    )
     held = [part[f.nodes[:, 0]] for f in problem.factors if f.kind.startswith("pose")]
     known, single = np.isin(part, np.concatenate([[-1], *held])), np.bincount(part)[part] == 1
     aims = [f for f in problem.factors if f.kind == "bearing"]
     aimed = stacked((f.nodes for f in aims), 2)
     angle, sure = stacked(f.z[:, 0] for f in aims), stacked(f.root[:, 0, 0] for f in aims)
-    here = (single & ~known)[fixed]
-    x[fixed[here], :d], known[fixed[here]] = fix[here], True
+    here = (single & ~known)[own_fixed]
+    x[own_fixed[here], :d], known[own_fixed[here]] = own_fix[here], True
     while not known.all():
+        k, side = np.nonzero(known[ends[:, ::-1]] & ~known[ends])
+        fixed = np.concatenate([own_fixed, ends[k, side]])
+        fix = np.concatenate([own_fix, x[ends[k, 1 - side], :d] + np.where(side[:, None], 1.0, -1.0) * vector[k]])
+        weight = np.concatenate([own_weight, vector_weight[k]])
         k, side = np.nonzero(known[ranges.nodes[:, ::-1]] & ~known[ranges.nodes] & (ranges.weight > 0)[:, None])
         own, places = ranges.nodes[k, side], ranges.nodes[k, 1 - side]
         seen = np.bincount(part[own], minlength=len(x))[part]
         best = np.lexsort([~single, seen, np.bincount(part[fixed], minlength=len(x))[part], ~known])[-1]
         moving, here = np.flatnonzero(part == part[best]), part[fixed] == part[best]
         there = (part[aimed[:, 0]] == part[best]) & known[aimed[:, 1]]
-        if single[best]:
+        if single[best] and here.any():
+            linked = parts(len(x), ends[(single | known)[ends].all(axis=1)])
+            moving = np.flatnonzero(single & ~known & np.isin(linked, linked[known]))
+            x = by_vectors(problem, x, np.setdiff1d(np.arange(len(x)), moving), vectors)
+        elif single[best]:
             moving = np.flatnonzero(single & ~known & (seen >= min(seen[best], d + 1)))
             for node in moving[seen[moving] > 0].tolist():
                 x[node, :d] = trilaterate(x[places[own == node], :d], ranges.distance[k[own == node]])
@@ -133,7 +161,7 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
             own_fixes = x[fixed[here], :d], fix[here], weight[here]
             x[moving] = _fitted(space, x[moving], own_fixes, distances, bearings, rank)
         known[moving] = True
-    return _crossed(problem, x)
+    return directed(problem, _crossed(problem, x))
 
 
 def _fitted(

@@ -11,6 +11,8 @@ from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
 from ..model.factor import reweighed, taken
 from ..model.problem import Problem, Search
+from ..model.space import exp
+from .graph_starts import parts
 from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
 
 STEPS = 12
@@ -36,6 +38,8 @@ ALIKE, ROUNDED = 1e-5, 1e-9
 ENOUGH, APART, PART = 6, 0.05, 0.8
 """Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
 elsewhere, and that of the ranges whose shortest paths make a start."""
+BARRIER = 0.1
+"""Cost by which the way between two ends must be higher, so that they are not one flat minimum."""
 ELSEWHERE = "another minimum, elsewhere, costs as much"
 EASED = (30.0, 10.0, 3.0, 1.0)
 """Times as large standard deviations of ranges."""
@@ -47,7 +51,7 @@ def race(
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     unwound: Callable[[Floats], bool],
     grown: str = "",
-    draws: bool = False,
+    draws: bool | None = False,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
@@ -64,7 +68,7 @@ def race(
         late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
         unwound: x -> whether no other minimum of a lower cost is to be feared.
         grown: which of the late starts is tried first where no other went straight.
-        draws: whether points are started from random places, too.
+        draws: whether points and bodies are started from random places, too; None: where noise explains no end.
     """
     system, taken, arrived = sparse(problem), 0, True
     tried, calm, straight, minima = dict[str, tuple[float, Floats]](), list[float](), set[str](), list[float]()
@@ -88,13 +92,14 @@ def race(
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        x = descend(x, ROUNDS[-1][1]) if draws else x
+        x = x if draws is False else descend(x, ROUNDS[-1][1])
         ends, least = list[tuple[float, Floats]](), system.cost(x)
+        drawing = least > limit if draws is None else draws
         most = QUIET if least <= mean + HIGH * np.sqrt(variance) else DRAWS
-        for k, away in enumerate(_away(problem, x) if draws else ()):
+        for k, away in enumerate(_away(problem, x) if drawing else ()):
             if k >= most:
                 break
-            y = descend(x + away, ROUNDS[-1][1])
+            y = descend(away, ROUNDS[-1][1])
             cost = system.cost(y)
             if arrived and cost < least + RIVAL:
                 ends.append((cost, y))
@@ -106,7 +111,8 @@ def race(
         near = [each for each in (*rivals, *minima) if higher(each, cost, SAME) and each < cost + RIVAL]
         near += [each for each, _ in ends if higher(each, cost) and each < cost + RIVAL]
         notes = (rival(min(near) - cost),) if near else ()
-        if any(not higher(c, cost) and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
+        alike = [y for c, y in ends if not higher(c, cost) and np.abs(y - x).max() > SAME * np.abs(x).max()]
+        if any(system.cost(0.5 * (x + y)) > cost + BARRIER for y in alike):
             notes = *notes, ELSEWHERE
         elif doubtful and not near:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
@@ -162,8 +168,12 @@ def race(
 
 
 def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
-    """Random moves of points (n, d) as far as these are from one another: of all of them, across the plane or line that
-    they are nearest to, and of one."""
+    """Nodes x (n, ambient) moved at random as far as they are from one another: all points, across the plane or line
+    that they are nearest to, and one; or bodies, which relative measurements hold together and no pose is measured of,
+    all or one, every other time turned alone."""
+    if problem.poses:
+        yield from _turned(problem, x)
+        return
     rng, (n, d), free = np.random.default_rng(0), x.shape, np.ones((len(x), 1))
     free[list(problem.fixed)] = 0.0
     around = x - x.mean(axis=0)
@@ -174,7 +184,28 @@ def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
             away[np.arange(n) != rng.integers(n)] = 0.0
         elif k % 4 == 3:
             away = np.outer(away @ thin, thin)
-        yield away
+        yield x + away
+
+
+def _turned(problem: Problem, x: Floats) -> Iterator[Floats]:
+    from scipy.spatial.transform import Rotation
+
+    rng, space, n = np.random.default_rng(0), problem.space, len(x)
+    d, at = space.dimension, space.position(x)
+    center = np.median(at, axis=0)  # what has gone far away draws nothing there
+    spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
+    part = parts(n, *(f.nodes[f.informative] for f in problem.factors if f.kind.startswith(("relative", "body"))))
+    held = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
+    free = np.setdiff1d(part, part[np.concatenate([np.array(problem.fixed, np.int64), *held])])
+    for k in range(min(DRAWS, POINTS // n) if len(free) else 0):
+        y = x.copy()
+        for body in free if k % 4 < 2 else rng.choice(free, 1):
+            own = np.flatnonzero(part == body)
+            turn = exp(rng.uniform(-np.pi, np.pi, 1)) if d == 2 else Rotation.random(random_state=rng).as_matrix()
+            middle, to = at[own].mean(axis=0), center if len(own) == 1 else at[own].mean(axis=0)
+            to = to + spread * rng.normal(size=d) * (k % 2 or len(own) == 1)
+            y[own] = space.join((at[own] - middle) @ turn.T + to, turn @ space.rotation(x[own]))
+        yield y
 
 
 def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
