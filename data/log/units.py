@@ -55,9 +55,9 @@ LEAST = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 CODES, APART, FEW = 3, 1.4, 10
 """Most numbers of a kind that stand for none, and times the largest that can be meant beyond which they are; least rows
 of one that could be meant, and times the usual step from one range of a pair to the next that is a leap."""
-VAGUE = 30.0
-"""Times the usual standard deviation of a kind, from which the largest, if it repeats, says that there was no
-measurement; squared, also if it does not."""
+VAGUE, NONSENSE = 30.0, 50.0
+"""Times the usual standard deviation of a vehicle's kind, from which the largest, if it repeats, says that there was no
+measurement (squared, also if it does not), and the least that does, whatever the unit: fixes may be of 2 cm or 5 m."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
 UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
@@ -141,7 +141,7 @@ def not_vague(rows: Rows, summary: "Summary") -> Rows:
     the usual of the vehicle."""
     std = rows["std"]
     ratio = std / std.groupby([rows["vehicle"], rows["kind"]]).transform("median")
-    vague = std[(ratio > VAGUE) & std.eq(std.groupby(rows["kind"]).transform("max"))]
+    vague = std[(ratio > VAGUE) & (std >= NONSENSE) & std.eq(std.groupby(rows["kind"]).transform("max"))]
     vague = vague[vague.map(vague.value_counts()).gt(1) | (ratio[vague.index] > VAGUE**2)]
     summary.refuse("measurements whose standard deviation says that there is none", rows.loc[vague.index])
     return rows.drop(vague.index)
