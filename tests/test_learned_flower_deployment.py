@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import winding
-from shell import ran
+from shell import ROOT, ran
 from test_learned_flower import in_process
 
 from coopoc import Fleet
@@ -31,7 +31,6 @@ from coopoc.learned.federation.local import local_fit
 from coopoc.learned.flower.job import job_of
 from coopoc.learned.recipes import Job, job_clients, untrained
 
-ROOT = Path(__file__).resolve().parents[1]
 TINY = {"local-epochs": 1, "piece": 10, "net-in-mult": 2, "net-out-mult": 1}
 CHANGE = " ".join(f"{key}={value}" for key, value in TINY.items())
 pytestmark = [

@@ -8,7 +8,7 @@ import corrupted
 import numpy as np
 import pytest
 from conftest import refused
-from shell import ran
+from shell import python, ran
 
 from coopoc import V2X, Fleet, InputError, JointFilter, Sensors, observe
 
@@ -109,7 +109,5 @@ for which, (name, last) in enumerate((("copied", 2), ("plain", 11))):
 
 def test_under_the_switch_scalar_and_vector_access_is_checked():
     """NUMBA_BOUNDSCHECK=1 holds for the intrinsics, which work on pointers, too."""
-    command = [sys.executable, "-c", CODE]
-    env = {**os.environ, "NUMBA_BOUNDSCHECK": "1"}
-    done = ran(command, check=True, env=env)
-    assert done.stdout.split("\n")[:-1] == ["copied checks", "plain checks"]
+    said = python("-c", CODE, env={**os.environ, "NUMBA_BOUNDSCHECK": "1"})
+    assert said.split("\n")[:-1] == ["copied checks", "plain checks"]

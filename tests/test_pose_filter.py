@@ -1,9 +1,7 @@
 """Pose filters against a dense oracle, filterpy, GTSAM, the position filter; streams against Tracks."""
 
 import os
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +10,7 @@ from conftest import refused, textbook
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import pose_filter as oracle
 from oracles.pace import heard
-from shell import ran
+from shell import ROOT, python
 
 import coopoc as co
 from coopoc.methods.poses.pose_inputs import pose_measurements, pose_noise, to_landmarks
@@ -216,7 +214,6 @@ def test_mistakes_of_streams_are_named(make, words):
 @pytest.mark.slow
 def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path):
     """numba's bounds checks, over members that come and go, in a process of its own."""
-    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
+    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = ran(words, env=env, cwd=Path(__file__).parents[1])
-    assert done.returncode == 0, done.stdout[-2000:]
+    python(*words, env=env, cwd=ROOT)

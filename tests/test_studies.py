@@ -18,7 +18,7 @@ from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain
 from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
-from coopoc.learned.recipes import Setting, jobs_of, load_method
+from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of, load_method
 from coopoc.plugins import find
 from coopoc.studies import convergence, error_cdf, lineup, scene, weights
 from coopoc.studies.paper import reported
@@ -28,7 +28,6 @@ from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Study
 
-WEIGHTS = Path(__file__).resolve().parents[1] / "learned" / "weights"
 CLASSIC = {"method": "gnss,kalman,lkf-sa,joint,bound", "runs": 4, "egos": "2", "max_neighbours": "0,2,6"}
 
 

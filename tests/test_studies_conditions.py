@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import formation_fleet, refused
+from test_study_figures import FILES
 
 import coopoc as co
 from coopoc import Sensors, run_study
 from coopoc.studies import conditions as study
 from coopoc.studies import scene
 from coopoc.study import numbers
-
-FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
 
 
 def conditions(file: Path) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], dict[str, Any]]]]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused
+from shell import ROOT
 
 import coopoc as co
 from coopoc.cli import _status
@@ -230,8 +231,7 @@ def test_nees_and_ratios_are_as_by_hand():
 
 def test_the_page_shows_the_committed_cards():
     """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
-    root = Path(__file__).resolve().parents[1]
-    cards = [json.loads(file.read_text()) for file in (root / "benchmarks" / "cards" / "worlds").glob("*.json")]
-    assert worlds_card.overview(cards) in (root / "docs" / "benchmark.md").read_text()
+    cards = [json.loads(file.read_text()) for file in (ROOT / "benchmarks" / "cards" / "worlds").glob("*.json")]
+    assert worlds_card.overview(cards) in (ROOT / "docs" / "benchmark.md").read_text()
     for card in cards:
         assert (card["split"], card["worlds"]["seed"]) == ("test", [*range(1000)])
