@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import refused, textbook
+from conftest import refused, textbook, without
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import pose_filter as oracle
 from oracles.pace import heard
@@ -53,10 +53,7 @@ def with_masts(fleet: co.Fleet) -> co.Fleet:
 @pytest.fixture(scope="module")
 def rough(crossing):
     """Vehicle 1 is away for a while, vehicle 2 comes late."""
-    position, velocity = crossing.position.copy(), crossing.velocity.copy()
-    for column, away in ((1, slice(25, 30)), (2, slice(0, 10))):
-        position[away, column] = velocity[away, column] = np.nan
-    fleet, marks = with_masts(replace(crossing, position=position, velocity=velocity)), ["mast", "tower"]
+    fleet, marks = with_masts(without(crossing, (slice(25, 30), 1), (slice(10), 2))), ["mast", "tower"]
     return with_gaps(co.observe(fleet, NOISE, LATE, runs=2, seed=4, frame="body", landmarks=marks))
 
 
@@ -152,15 +149,6 @@ def test_it_is_as_good_as_the_dense_iterated_filter(crossing):
     dense = [oracle.pose_filter(measured, noise, (begin[k], (1.0,) * 4), 4, 10, k)[0] for k in range(runs)]
     ours, theirs = (float(np.sqrt(np.mean((each[..., :3] - drive.position) ** 2))) for each in (x, np.stack(dense)))
     assert ours < 1.02 * theirs
-
-
-def lone(steps: int = 12) -> co.Fleet:
-    """A vehicle on a circle with a landmark at its side."""
-    t = np.arange(steps) * 0.1
-    way = np.c_[10 * np.sin(t), 10 - 10 * np.cos(t), 0 * t]
-    position = np.c_[way, np.broadcast_to([3.0, 4.0, 0.0], way.shape)]
-    velocity = np.diff(position, axis=0, prepend=position[:1]) / 0.1
-    return co.Fleet(("a", "mast"), t, position, velocity, heading=np.c_[t, 0 * t])
 
 
 def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:
