@@ -15,7 +15,6 @@ import uuid
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -54,14 +53,7 @@ def _compiled():
 @pytest.fixture(scope="module")
 def example():
     """examples/flower_deployment.py as a module."""
-    return imported("flower_deployment")
-
-
-def imported(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
+    return importlib.import_module("flower_deployment")
 
 
 @pytest.fixture
