@@ -74,8 +74,8 @@ import coopoc as co
 from coopoc.cli import main
 fleet = co.load_fleet("town10")
 v2x = co.V2X(max_neighbours=2)
-seen = co.observe(fleet.between(0, 30), co.Sensors.paper_scenario2(), v2x, runs=1, seed=0, observers=[24])
-print(co.JointFilter("nominal")(seen, egos=[24]).x.shape)
+seen = co.observe(fleet.between(0, 30), co.Sensors.paper_scenario2(), v2x, observers=[24])
+print(co.JointFilter()(seen, egos=[24]).x.shape)
 print(co.solve(co.Problem.from_snapshot(seen, step=9, ego=24)).status.name)
 for words in (["list"], ["run", "side_by_side", "--set", "method=kalman,joint", "runs=1", "max_neighbours=6"]):
     try:

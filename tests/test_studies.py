@@ -55,7 +55,7 @@ def test_the_clients_are_drawn_where_they_drive():
 
 def test_neighbours_runs_without_any_training(tmp_path):
     """Only what is asked for is made: no weights for classical methods, and views of what was run."""
-    results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)
+    results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path)
     assert results.failed == 0
     assert not (tmp_path / "weights").exists()
     bound = [results.interval("rt_le_m", method="bound", max_neighbours=k).mean for k in (0, 2, 6)]
@@ -185,7 +185,7 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10):
             co.GNSS(),
             load_method("fedkalmannet"),
             co.LKFSA("identity"),
-            co.JointFilter("nominal"),
+            co.JointFilter(),
         ):
             each = rt_le(method(seen, egos), town10)
             assert (each < 7.0).all()

@@ -218,7 +218,7 @@ def test_the_command_of_a_worst_world_repeats_its_number(tmp_path, capsys, monke
 def test_nees_and_ratios_are_as_by_hand():
     card = worlds_card.worlds_card("joint", 1, seed=2)
     one = world(2)
-    tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter("nominal"), co.Kalman("nominal"))]
+    tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter(), co.Kalman())]
     joint, alone = (co.rt_le(track, one.fleet).mean() for track in tracks)
     (ratio,) = card["summary"]["over_better"]
     assert ratio == pytest.approx(joint / min(joint, alone), rel=1e-4)

@@ -76,5 +76,5 @@ def test_every_kind_is_on_the_page():
 def test_egos_are_a_number_a_list_or_a_name(folder, tmp_path):
     settings = {"data": str(folder / "mylog"), "method": "kalman", "max_neighbours": "0"}
     for egos, wanted in ((2, 2), (["red", "blue"], 2), ("green", 1), ("red,blue", 2), ("auto", 3)):
-        frame = co.run_study("side_by_side", tmp_path, settings={**settings, "egos": egos}, progress=False).frame
+        frame = co.run_study("side_by_side", tmp_path, settings={**settings, "egos": egos}).frame
         assert len(np.unique(frame["ego"])) == wanted
