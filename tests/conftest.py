@@ -2,17 +2,17 @@
 
 import importlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
-from coopoc import Fleet, Recording, load_fleet
-from coopoc.arrays import Floats
+from coopoc import Fleet, Links, Recording, load_fleet
+from coopoc.arrays import Bools, Floats
 from coopoc.data.fetch import public
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import InputError
@@ -105,19 +105,30 @@ def crossing_fleet(vehicles: int = 8, steps: int = 60, seed: int = 3) -> Fleet:
     return moving("c", t, position)
 
 
+def without(fleet: Fleet, *away: tuple[slice, int | slice]) -> Fleet:
+    """The fleet whose vehicles are away: (steps, columns)."""
+    there = np.ones(fleet.position.shape)
+    for steps, columns in away:
+        there[steps, columns] = np.nan
+    return replace(fleet, position=there * fleet.position, velocity=there * fleet.velocity)
+
+
 def coming_and_going(fleet: Fleet) -> Fleet:
     """Vehicles 2 to 4 come late, 4 to 6 leave early."""
-    position, velocity = fleet.position.copy(), fleet.velocity.copy()
-    late, early = len(fleet.t) // 3, 2 * len(fleet.t) // 3
-    for column, away in ((slice(2, 5), slice(0, late)), (slice(4, 7), slice(early, None))):
-        position[away, column] = velocity[away, column] = np.nan
-    return replace(fleet, position=position, velocity=velocity)
+    third = len(fleet.t) // 3
+    return without(fleet, (slice(third), slice(2, 5)), (slice(2 * len(fleet.t) // 3, None), slice(4, 7)))
 
 
 def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
     """Vehicles that stand."""
     where = np.repeat(np.array(position, dtype=float)[None], steps, axis=0)
     return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
+
+
+def among(many: Links, few: Links) -> Bools:
+    """Which links are also those of a recording with fewer neighbours."""
+    keys = [links.step * 10**6 + links.observer * 1000 + links.neighbour for links in (many, few)]
+    return np.isin(*keys)
 
 
 def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None)) -> Recording:
@@ -129,11 +140,12 @@ def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None
     return replace(recording, gnss=gnss)
 
 
-@pytest.fixture
-def study(monkeypatch: pytest.MonkeyPatch) -> Study:
+@pytest.fixture(scope="module")
+def study() -> Iterator[Study]:
     """The small study that is installed as a third party's."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent / "distribution"))
-    return cast(Study, importlib.import_module("small_study").STUDY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
+        yield importlib.import_module("small_study").STUDY
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ NOISE = Sensors(gnss_std=(1.5, 1.5, 0.5), velocity_std_ratio=0.0, velocity_floor
 
 def observed(fleet: Fleet, k: int = 3, **channel: Any) -> Recording:
     """One run of noisy measurements, with noise on the velocity as wide as its floor."""
-    recording = observe(fleet, NOISE, V2X(k, 120.0, **channel), runs=1, seed=3)
+    recording = observe(fleet, NOISE, V2X(k, 120.0, **channel), seed=3)
     noise = np.random.default_rng(0).normal(0, 0.1, recording.velocity.shape) * [1, 1, 0]
     return replace(recording, velocity=recording.velocity + noise)
 

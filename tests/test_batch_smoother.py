@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused, textbook
+from conftest import coming_and_going, refused, textbook, without
 from oracles.batch_smoother import batch_smoother
 from scipy import stats
 from scipy.optimize import least_squares
@@ -44,10 +44,9 @@ def holed(recording: Recording, fixes: float, angles: float, delays: int = 0) ->
 
 def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absences: bool = True) -> Recording:
     fleet = crossing.select(range(6)).between(0, 14)
-    position, velocity = fleet.position.copy(), fleet.velocity.copy()
-    for column, away in ((1, slice(4, 9)), (2, slice(0, 6)), (3, slice(9, 14))) if absences else ():
-        position[away, column] = velocity[away, column] = np.nan
-    recording = observe(replace(fleet, position=position, velocity=velocity), S2, CHANNELS[channel], runs=runs)
+    if absences:
+        fleet = without(fleet, (slice(4, 9), 1), (slice(6), 2), (slice(9, 14), 3))
+    recording = observe(fleet, S2, CHANNELS[channel], runs=runs)
     return holed(recording, 0.5, 0.2, 3 if channel == "lossy and late" else 0) if gaps else recording
 
 

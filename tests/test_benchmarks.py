@@ -1,18 +1,18 @@
 """Benchmarks: the gate of benchmarks/run.py on made-up tables, CL-Bench and its cards."""
 
 import hashlib
-import importlib
 import json
 import re
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import run
 from conftest import measured, refused
+from shell import ROOT
 
 import coopoc as co
 from coopoc.data.log.residuals import SURE
@@ -23,35 +23,24 @@ from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
 BASELINE = {"a: ours": {"ratio": 1.0, "tolerance": 1.5}, "b: ours": {"ratio": 0.01, "tolerance": 2.0}}
 
 
-@pytest.fixture
-def load():
-    """Import a benchmark by name; some need libraries."""
-    return importlib.import_module
-
-
-@pytest.fixture
-def run():
-    return importlib.import_module("run")
-
-
 def row(name: str, ratio: float, right: bool | None = True) -> dict[str, Any]:
     return {"name": name, "us": 7.0, "ratio": ratio, "right": right}
 
 
 @pytest.mark.parametrize("ratio", [1.51, float("nan")])
-def test_the_gate_names_the_row_that_is_slower(run, ratio):
+def test_the_gate_names_the_row_that_is_slower(ratio):
     printed = run.slower([row("a: ours", ratio), row("b: ours", 0.01)], BASELINE, ["a", "b"])
     assert len(printed) == 1
     assert printed[0].startswith("a: ours: ratio")
     assert "1.5 allowed" in printed[0]
 
 
-def test_a_row_that_was_not_measured_fails_unless_its_benchmark_did_not_run(run):
+def test_a_row_that_was_not_measured_fails_unless_its_benchmark_did_not_run():
     assert run.slower([row("a: ours", 1.0)], BASELINE, ["a", "b"]) == ["b: ours: in the baseline, but not measured"]
     assert run.slower([row("a: ours", 1.0)], BASELINE, ["a"]) == []
 
 
-def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows(run):
+def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows():
     rows = [
         row("b: ours", 0.0123456),
         row("a: ours, new", 3.0),
@@ -73,15 +62,7 @@ def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows(run
         ([row("ours", 1.0, right=False)], [], 1),
     ],
 )
-def test_the_command_prints_writes_and_fails(
-    run,
-    monkeypatch,
-    tmp_path,
-    capsys,
-    rows,
-    arguments,
-    code,
-):
+def test_the_command_prints_writes_and_fails(monkeypatch, tmp_path, capsys, rows, arguments, code):
     monkeypatch.setattr(run, "RESULTS", tmp_path / "results.json")
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     run.BASELINE.write_text(json.dumps({"growth: ours": BASELINE["a: ours"]}))
@@ -95,14 +76,16 @@ def test_the_command_prints_writes_and_fails(
     assert ("FAILED growth: ours" in printed) == bool(code)
 
 
-def test_stone_soup_ends_where_we_end(load, monkeypatch):
+def test_stone_soup_ends_where_we_end(monkeypatch):
     """Its iterated update and its filter; one extended update does not."""
     pytest.importorskip("stonesoup", reason="pip install stonesoup")
-    classical = load("classical")
+    import classical
+
     monkeypatch.setattr(classical, "RUNS", 2)
     monkeypatch.setattr(classical, "STEPS", 21)
     monkeypatch.delitem(sys.modules, "stone_soup", raising=False)
-    soup = load("stone_soup")
+    import stone_soup as soup
+
     snapshot = soup.snapshot()
     assert [snapshot.right(row.call()) for row in snapshot.rows] == [True, True, False]
     assert [row.judged for row in snapshot.rows] == [True, True, False]
@@ -110,7 +93,6 @@ def test_stone_soup_ends_where_we_end(load, monkeypatch):
     assert all(joint.right(row.call()) for row in joint.rows)
 
 
-ROOT = Path(__file__).resolve().parents[1]
 CARDS = sorted((ROOT / "benchmarks" / "cards").glob("*.json"))
 PAPER = next(task for task in TASKS if task.name == "paper")
 
@@ -157,7 +139,7 @@ def test_the_cards_method_is_scored_as_by_hand(short, tmp_path):
     task = replace(PAPER, runs=2, egos=2)
     fleet, egos = co.load_fleet("town10"), list(task.columns)
     seen = co.observe(fleet, task.sensors, task.v2x, runs=2, seed=task.seed, observers=egos)
-    error = co.rt_le(co.JointFilter("nominal")(seen, egos), fleet)
+    error = co.rt_le(co.JointFilter()(seen, egos), fleet)
     assert row["rt_le_m"][0] == pytest.approx(error.mean(), abs=1e-4)
     least = np.sqrt(np.mean([co.bound_rt_le(co.posterior_bound(fleet, task.sensors, e, task.v2x)) ** 2 for e in egos]))
     assert row["bound_m"] == pytest.approx(least, abs=1e-4)

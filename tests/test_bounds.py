@@ -6,7 +6,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused
+from conftest import coming_and_going, refused, standing
 from scipy import stats
 from test_pose_methods import convoy
 
@@ -147,9 +147,7 @@ def test_more_noise_is_never_more_information(what, crossing):
     assert bound_rt_le(large) > bound_rt_le(small)
 
 
-@pytest.mark.parametrize(
-    ("method", "neighbours"), [(Kalman("nominal"), 0), (JointFilter("nominal"), 6)], ids=["solo", "star"]
-)
+@pytest.mark.parametrize(("method", "neighbours"), [(Kalman(), 0), (JointFilter(), 6)], ids=["solo", "star"])
 def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours, formation):
     """rms RT-LE against the bound beyond its interval (chi-square on the runs), and not far above it."""
     fleet = formation.between(0, 400)
@@ -236,7 +234,7 @@ def test_pose_bounds_equal_gtsam_marginals(masts, compass):
 
 def test_a_compass_and_a_gyro_alone_are_a_scalar_filter():
     """Closed form at rest: p = -q/2 + sqrt(q^2/4 + q r); a bias of the compass adds its variance."""
-    fleet = co.Fleet(("a",), np.arange(2000) * 0.1, np.zeros((2000, 1, 3)), np.zeros((2000, 1, 3)))
+    fleet = standing([[0, 0, 0]], 2000)
     sensors = co.Sensors(heading_std=0.1, yaw_rate_std=0.02)
     q, r = (0.1 * 0.02) ** 2, 0.1**2
     level = -q / 2 + np.sqrt(q * q / 4 + q * r)

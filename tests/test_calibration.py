@@ -1,13 +1,12 @@
 """Filters alone on roads and their calibration: filterpy's and Stone Soup's extended filters, real cars, logs of one's
 own; what is fitted must be better on what was held out."""
 
-import importlib
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rivals
 from conftest import measured, refused, winding
 from numpy.testing import assert_allclose
 
@@ -41,15 +40,8 @@ def seen(steps: int = 300, runs: int = 2, **noise: Any) -> tuple[Recording, Flee
     return turned(replace(recording, gnss=gnss), 0.15, 0.05), fleet
 
 
-@pytest.fixture
-def rivals(monkeypatch):
-    """benchmarks/rivals.py."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
-    return importlib.import_module("rivals")
-
-
 @pytest.mark.parametrize("name", ["EKF", "StoneSoup"])
-def test_without_priors_it_is_the_extended_filter_of_others(rivals, name):
+def test_without_priors_it_is_the_extended_filter_of_others(name):
     if name == "StoneSoup":
         pytest.importorskip("stonesoup", reason="pip install stonesoup")
     recording, _ = seen(runs=1)

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from shell import ran
+from shell import python, ran
 from small_runs import ENV
 
 COMMAND = [sys.executable, "-m", "coopoc.cli"]
@@ -89,12 +89,10 @@ def answers(tmp_path_factory):
         *(words.split() for words, _ in MISTAKES),
         *map(str.split, OF_OTHERS),
     ]
-    command = [sys.executable, "-c", ONE_BY_ONE, json.dumps(lines)]
     cwd = tmp_path_factory.mktemp("answers")
-    done = ran(command, cwd=cwd, env=ENV, timeout=120)
-    assert done.returncode == 0, done.stderr
+    said = python("-c", ONE_BY_ONE, json.dumps(lines), cwd=cwd, env=ENV, timeout=120)
     assert not list(cwd.iterdir())
-    return {tuple(words): json.loads(line) for words, line in zip(lines, done.stdout.splitlines(), strict=True)}
+    return {tuple(words): json.loads(line) for words, line in zip(lines, said.splitlines(), strict=True)}
 
 
 @pytest.mark.parametrize("name", NAMES)

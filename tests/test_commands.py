@@ -5,8 +5,6 @@ import inspect
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
@@ -16,7 +14,7 @@ from typing import Any
 import pytest
 import tyro
 from conftest import located
-from shell import ran
+from shell import ROOT, TUTORIALS, python
 
 import coopoc as co
 from coopoc import plugins
@@ -24,9 +22,8 @@ from coopoc.cli import OWN, _status
 from coopoc.data.fetch import public
 from coopoc.study.cell import assignments
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-PAGES += [*sorted((ROOT / "docs" / "tutorials").glob("*.py")), ROOT / "docs" / "pages.py"]
+PAGES += [*TUTORIALS, ROOT / "docs" / "pages.py"]
 WORDS = {"NAME": "neighbours", "FOLDER": "runs/neighbours", "METHOD": "joint", "RECIPE": "okf", "LOG": "mylog"}
 WORDS["$SLURM_ARRAY_TASK_ID"] = "1"
 """What stands for a choice of the reader."""
@@ -86,12 +83,12 @@ def folder(tmp_path_factory):
         for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
             if name := re.match(r"# (\w+\.py)\n", code):
                 (out / name.group(1)).write_text(code)
-    subprocess.run([sys.executable, "make_log.py"], cwd=out, check=True)
+    python("make_log.py", cwd=out)
     (out / "mine.py").write_text(f"{(out / 'alpha.py').read_text()}\nOwn = Alpha\n")
     body = re.search(r'```python\n((?:(?!```).)*"robots.csv", index=False\)\n)', text, flags=re.DOTALL)
     assert body
     (out / "robots.py").write_text(body.group(1))
-    subprocess.run([sys.executable, "robots.py"], cwd=out, check=True)
+    python("robots.py", cwd=out)
     log = (out / "mylog" / "measurements.csv").read_text()
     (out / "log.csv").write_text(log.replace("t,vehicle", "zeit,auto", 1))
     fleet = co.load_fleet("town10").between(0, 50)
@@ -173,8 +170,7 @@ def test_scripts_and_targets_of_the_pages_exist():
 
 
 def test_the_help_of_a_study_lists_its_settings():
-    done = ran([sys.executable, "-m", "coopoc.cli", "run", "neighbours", "--help"])
-    assert done.returncode == 0
+    said = python("-m", "coopoc.cli", "run", "neighbours", "--help")
     for line in ("  runs=30", "  max_neighbours=0,1,2,3,4,6,8,10", "  data=town10  (of town04, town10, "):
-        assert line in done.stdout
-    assert "--retry-failed" in done.stdout
+        assert line in said
+    assert "--retry-failed" in said

@@ -48,7 +48,7 @@ def test_star_filters_get_rows_on_convoys(tmp_path):
     assert benchmark.benchmark(("joint", "kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
     joint, alone = (json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "kalman"))
     recording, fleet = convoys.convoy("convoy-kitti", measured())
-    track = co.JointFilter("nominal")(recording, recording.ids)
+    track = co.JointFilter()(recording, recording.ids)
     gap = (track.x - fleet.position)[..., :2]
     assert joint["rt_le_m"][0] == pytest.approx(np.sqrt(np.square(gap).sum(-1).mean()), rel=0.15)  # a mean over blocks
     assert joint["rt_le_m"][0] < alone["rt_le_m"][0]

@@ -61,7 +61,7 @@ def test_drift_is_each_receivers_and_the_common_error_everyones():
 def test_alone_it_is_filterpys_augmented_filter():
     """filterpy with state (x, drift, common) per axis, from the first fix with a vague position."""
     fleet = convoy(1)
-    seen = observe(fleet, BOTH, V2X(0), runs=1, seed=3)
+    seen = observe(fleet, BOTH, V2X(0), seed=3)
     track, keep = CooperativeFilter(priors=AS_STATED)(seen, [0]), np.exp(-0.1 / 5.0)
     q = NoiseModel.nominal(BOTH).process_variance(seen)[0, :, 0]
     for axis in range(3):

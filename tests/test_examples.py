@@ -1,8 +1,6 @@
 """The examples run as they stand; the lazy names of the package are those that types see."""
 
 import ast
-import sys
-from pathlib import Path
 from typing import Any
 
 import judge
@@ -11,7 +9,7 @@ import pytest
 import star
 from architecture import layers
 from numpy.testing import assert_allclose
-from shell import ran
+from shell import ROOT, python
 from torch.nn import GRUCell
 
 import coopoc
@@ -19,12 +17,9 @@ from coopoc.learned.nets.gain_net import GainNet
 from coopoc.studies.world_faults import KINDS
 from coopoc.studies.worlds import world
 
-ROOT = Path(__file__).resolve().parents[1]
-
 
 def test_first_steps_runs():
-    script = ROOT / "examples" / "first_steps.py"
-    out = ran([sys.executable, "-W", "error", script], check=True).stdout
+    out = python("-W", "error", ROOT / "examples" / "first_steps.py")
     assert out.count("SOLVED") == 4
     assert "FedKalmanNet" in out
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused, textbook
-from shell import ran
+from shell import ROOT, python, ran
 
 from coopoc import GNSS, V2X, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.evaluate.metrics import measure
@@ -27,8 +27,8 @@ from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.world.channels import channel
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "extend.md"
-COOPOC = f"{sys.executable} -W error -m coopoc.cli"
+PAGE = ROOT / "docs" / "extend.md"
+COOPOC = "-W error -m coopoc.cli"
 
 
 def blocks(language: str) -> list[str]:
@@ -38,9 +38,7 @@ def blocks(language: str) -> list[str]:
 def shell(command: str, folder: Path, **env: str) -> str:
     """What a command prints; the test fails with its complaint if it fails."""
     script = command.replace("coopoc ", f"{COOPOC} ", 1)
-    done = ran(script.split(), cwd=folder, env={**os.environ, **env})
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return python(*script.split(), cwd=folder, env={**os.environ, **env})
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +60,7 @@ def output(folder: Path, word: str, change: Callable[[str], str] = str) -> str:
     """What the page's block with a word in it prints."""
     (block,) = [text for text in blocks("python") if word in text]
     (folder / "block.py").write_text(change(block))
-    done = ran([sys.executable, "-W", "error", "block.py"], cwd=folder)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return python("-W", "error", "block.py", cwd=folder)
 
 
 def test_a_method_of_ones_own_beside_others(folder):
@@ -188,9 +184,9 @@ def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder, tmp_path):
     output(folder, "own_rules.py:ClippedMean", lambda block: block + differ)
     (command,) = commands("own_rules.py:best_half")
     (folder / "examples").mkdir()
-    shutil.copy(Path(__file__).parents[1] / "examples" / "aggregation.py", folder / "examples")
+    shutil.copy(ROOT / "examples" / "aggregation.py", folder / "examples")
     assert "| best half " in shell(command, folder)
-    wrong = f"{COOPOC} train fedkalmannet --aggregate own_rules.py:best_hlaf --out {tmp_path}"
+    wrong = f"{sys.executable} {COOPOC} train fedkalmannet --aggregate own_rules.py:best_hlaf --out {tmp_path}"
     done = ran(wrong.split(), cwd=folder)
     assert done.returncode == 2
     assert "Did you mean own_rules.py:best_half?" in done.stderr

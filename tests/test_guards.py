@@ -67,9 +67,9 @@ def test_useless_weights_are_not_saved(monkeypatch, tmp_path):
     bad = Recipe("centralised", Schedule(epochs=1, learning_rate=1e-9), piece=20, options=(("start_gain", 0.9),))
     monkeypatch.setitem(recipes.RECIPES, "centralised", bad)
     with refused("times that of a Kalman filter with fitted noise"):
-        train_all(FLEET, tmp_path, seeds=[0], recipes=["centralised"], progress=False, worst=1.1)
+        train_all(FLEET, tmp_path, seeds=[0], recipes=["centralised"], worst=1.1)
     assert not list(tmp_path.iterdir())
-    assert train_all(FLEET, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
+    assert train_all(FLEET, tmp_path, seeds=[0], recipes=["centralised"])
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.5, 1.0])

@@ -8,11 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from shell import ran
+from shell import ROOT, python, ran
 
 from coopoc.errors import MissingLibraryError
 
-ROOT = Path(__file__).resolve().parents[1]
 PARTS = ["coopoc", "learned", "studies", "data", "pyproject.toml", "README.md", "LICENSE", "NOTICE"]
 
 
@@ -31,9 +30,7 @@ def site(tmp_path_factory):
 def outside(site: Path, tmp_path: Path, *command: str) -> str:
     """Output of a command run in an empty folder that sees the installed wheel first."""
     env = {**os.environ, "PYTHONPATH": str(site), "MYPYPATH": str(site)}
-    done = ran(command, cwd=tmp_path, env=env)
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
-    return done.stdout
+    return python(*command, cwd=tmp_path, env=env)
 
 
 def test_everything_imports_from_the_wheel(site, tmp_path):
@@ -45,7 +42,7 @@ print(load_method("fedkalmannet").name)
 print(coopoc.__file__, coopoc.learned.__file__, coopoc.studies.__file__, coopoc.data.__file__)
 print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in ("town10", "town10-clients")))
 """
-    out = outside(site, tmp_path, sys.executable, "-W", "error", "-c", code)
+    out = outside(site, tmp_path, "-W", "error", "-c", code)
     assert out.splitlines()[0] == "fedkalmannet"
     assert out.splitlines()[1].count(str(site)) == 4
     assert "town04: 60 vehicles" in out
@@ -55,7 +52,7 @@ print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in
 @pytest.mark.slow
 def test_installed_package_is_strictly_typed(site, tmp_path):
     config = str(ROOT / "pyproject.toml")
-    outside(site, tmp_path, sys.executable, "-m", "mypy", "--strict", "--config-file", config, "-p", "coopoc")
+    outside(site, tmp_path, "-m", "mypy", "--strict", "--config-file", config, "-p", "coopoc")
 
 
 WITHOUT_TORCH = """
@@ -77,8 +74,8 @@ import coopoc as co
 from coopoc.cli import main
 fleet = co.load_fleet("town10")
 v2x = co.V2X(max_neighbours=2)
-seen = co.observe(fleet.between(0, 30), co.Sensors.paper_scenario2(), v2x, runs=1, seed=0, observers=[24])
-print(co.JointFilter("nominal")(seen, egos=[24]).x.shape)
+seen = co.observe(fleet.between(0, 30), co.Sensors.paper_scenario2(), v2x, observers=[24])
+print(co.JointFilter()(seen, egos=[24]).x.shape)
 print(co.solve(co.Problem.from_snapshot(seen, step=9, ego=24)).status.name)
 for words in (["list"], ["run", "side_by_side", "--set", "method=kalman,joint", "runs=1", "max_neighbours=6"]):
     try:

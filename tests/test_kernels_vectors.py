@@ -1,11 +1,10 @@
 """Vectors of runs and small matrices: blocks against NumPy, side by side and alone."""
 
 import os
-import sys
 
 import numpy as np
 import pytest
-from shell import ran
+from shell import python
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import as_written
@@ -80,19 +79,7 @@ def test_blocks_against_numpy(batched):
 
 def test_plain_njit_gives_the_same_without_the_private_hooks(tmp_path):
     env = {**os.environ, "COOPOC_PLAIN_NJIT": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        __file__,
-        "-k",
-        "against_numpy and False",
-    ]
-    done = ran(command, env=env)
-    assert done.returncode == 0, done.stdout
+    python("-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "against_numpy and False", env=env)
 
 
 def test_angles_side_by_side_are_those_of_atan2():

@@ -1,14 +1,12 @@
 """Imports run one way: world, optimize, methods, evaluate, study, cli; and the core names no plug-in package."""
 
 import ast
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from shell import ran
+from shell import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[1]
 FLOORS = ["kernels", "formats", "world", "optimize", "methods", "evaluate", "study", "cli"]
 
 
@@ -101,7 +99,7 @@ def test_no_file_imports_in_a_circle(package):
 
 def test_import_is_light():
     """`import coopoc` and the core nouns load none of the heavy libraries."""
-    heavy = {"torch", "cvxpy", "gtsam", "casadi", "osqp", "pandas", "matplotlib", "sklearn"}
+    heavy = {"numba", "torch", "cvxpy", "gtsam", "casadi", "osqp", "pandas", "matplotlib", "sklearn"}
     code = "import sys, coopoc; coopoc.Fleet, coopoc.observe; print(*sys.modules)"
-    loaded = ran([sys.executable, "-c", code], check=True).stdout.split()
+    loaded = python("-c", code).split()
     assert not heavy & set(loaded)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from conftest import refused
 from export_onnx import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
-from shell import ran
+from shell import ROOT, python
 
 from coopoc.arrays import AnyArray
 from coopoc.errors import MissingLibraryError
@@ -21,7 +21,6 @@ from coopoc.learned import GainNet, OptimisedKF, checkpoint
 from coopoc.learned.recipes import WEIGHTS
 
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
-ROOT = Path(__file__).resolve().parents[1]
 Step = Callable[[Sequence[AnyArray]], Sequence[AnyArray]]
 
 
@@ -113,7 +112,7 @@ def test_the_documented_program_needs_onnxruntime_and_numpy_only(file, tmp_path)
     (tmp_path / "fedkalmannet.onnx").write_bytes(file.read_bytes())
     ban = "import sys\nfor name in ('torch', 'coopoc', 'onnx'):\n    sys.modules[name] = None\n"
     (tmp_path / "run.py").write_text(ban + block)
-    out = ran([sys.executable, "-W", "error", "run.py"], cwd=tmp_path, check=True).stdout
+    out = python("-W", "error", "run.py", cwd=tmp_path)
     x = np.array([float(word) for word in re.findall(r"-?\d+\.\d+", out)])
     assert x.shape == (3,)
     assert np.linalg.norm(x - [1090.0, 2000.0, 0.0]) < 3.0, "it drove 10 s at 9 m/s"

@@ -1,13 +1,12 @@
 """The sections of docs/extend.md on nets and recipes, as they stand: trained, federated, saved, streamed, studied."""
 
 import re
-import sys
 
 import pytest
 import torch
 from conftest import refused
 from export_onnx import to_onnx
-from shell import ran
+from shell import python
 from test_extend import blocks, commands, shell
 
 from coopoc.learned import Checkpoint, load, save
@@ -30,8 +29,7 @@ def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder):
     (block,) = (text for text in blocks("python") if "load_method" in text)
     script = folder / "own_net.py"
     script.write_text(f"{block}\nassert abs(x - track.x[0, -1, 0]).max() < 1e-4\n")
-    done = ran([sys.executable, "-W", "error", script], cwd=folder)
-    assert done.returncode == 0, done.stderr
+    python("-W", "error", script, cwd=folder)
 
 
 @pytest.mark.slow

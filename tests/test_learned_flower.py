@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from importlib.metadata import version
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import pytest
 import torch
 from conftest import refused, winding
 from logs import long, observed, write
+from shell import ROOT
 from torch import Tensor
 
 from coopoc import Fleet
@@ -31,7 +31,6 @@ from coopoc.learned.recipes import RECIPES, Job, Setting, job_clients, untrained
 if TYPE_CHECKING:
     from flwr.app import Message
 
-ROOT = Path(__file__).resolve().parents[1]
 TINY: dict[str, Any] = {
     "recipe": "fedkalmannet",
     "rounds": 3,

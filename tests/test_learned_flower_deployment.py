@@ -15,13 +15,12 @@ import uuid
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import winding
-from shell import ran
+from shell import ROOT, ran
 from test_learned_flower import in_process
 
 from coopoc import Fleet
@@ -31,7 +30,6 @@ from coopoc.learned.federation.local import local_fit
 from coopoc.learned.flower.job import job_of
 from coopoc.learned.recipes import Job, job_clients, untrained
 
-ROOT = Path(__file__).resolve().parents[1]
 TINY = {"local-epochs": 1, "piece": 10, "net-in-mult": 2, "net-out-mult": 1}
 CHANGE = " ".join(f"{key}={value}" for key, value in TINY.items())
 pytestmark = [
@@ -55,14 +53,7 @@ def _compiled():
 @pytest.fixture(scope="module")
 def example():
     """examples/flower_deployment.py as a module."""
-    return imported("flower_deployment")
-
-
-def imported(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
+    return importlib.import_module("flower_deployment")
 
 
 @pytest.fixture

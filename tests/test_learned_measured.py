@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from conftest import refused
+from conftest import refused, without
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
@@ -40,12 +40,6 @@ def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> 
     recording = observe(fleet, Sensors(gnss_std=(1.5, 1.5, 1.5)), V2X(max_neighbours=0))
     fixes = np.where((np.arange(steps) % every == 0)[:, None, None], recording.gnss, np.nan)
     return replace(recording, gnss=fixes), fleet
-
-
-def without_truth(fleet: Fleet, steps: slice, vehicle: int) -> Fleet:
-    position, velocity = fleet.position.copy(), fleet.velocity.copy()
-    position[steps, vehicle] = velocity[steps, vehicle] = np.nan
-    return replace(fleet, position=position, velocity=velocity)
 
 
 def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:
@@ -81,7 +75,7 @@ def test_a_gap_of_the_odometry_is_in_no_piece_and_one_of_the_truth_has_no_loss()
     recording, fleet = walk(vehicles=1)
     velocity, gnss = recording.velocity.copy(), recording.gnss.copy()
     velocity[:, 50:60], gnss[:, 50:60] = np.nan, np.nan
-    holed = MeasuredDrives(replace(recording, velocity=velocity, gnss=gnss), without_truth(fleet, slice(70, 81), 0))
+    holed = MeasuredDrives(replace(recording, velocity=velocity, gnss=gnss), without(fleet, (slice(70, 81), 0)))
     (only,) = measured_clients(holed, piece=20)
     pieces = Segments.join([only.training, only.validation])
     assert bool(pieces.velocity.isfinite().all())
@@ -120,9 +114,10 @@ def test_what_cannot_be_learned_from_is_refused():
         MeasuredDrives(recording, None)  # type: ignore[arg-type]
     with refused("members and steps"):
         MeasuredDrives(recording, fleet.between(0, 50))
+    unknown = without(fleet, (slice(None), 1))
     with refused("truth = none of v1"):
-        MeasuredDrives(recording, without_truth(fleet, slice(None), 1))
-    assert MeasuredDrives(recording, without_truth(fleet, slice(None), 1), ids=("v0",)).ids == ("v0",)
+        MeasuredDrives(recording, unknown)
+    assert MeasuredDrives(recording, unknown, ids=("v0",)).ids == ("v0",)
     with refused("v0 with 1 pieces of 40"):
         measured_clients(MeasuredDrives(recording, fleet), piece=40)
     with refused("has no vehicle that moves"):
@@ -184,7 +179,6 @@ def test_a_log_trains_and_its_rest_scores(log, tmp_path, capsys):
         "side_by_side",
         tmp_path,
         settings=settings | {"method": "gnss,kalman,okf", "noise_model": "fitted"},
-        progress=False,
     )
     level = found.frame.groupby("method")["rt_le_m"].mean()
     assert file.stat().st_mtime_ns == made
@@ -202,7 +196,7 @@ def test_every_recipe_trains_on_a_log_and_follows_the_rest(name, log, tmp_path, 
     monkeypatch.setitem(RECIPES, name, quick)
     whole = co.read_log(log)
     first, rest = whole.part(until=65), whole.part(since=65)
-    made = train_all(first, tmp_path, recipes=[name], seeds=[0], progress=False)
+    made = train_all(first, tmp_path, recipes=[name], seeds=[0])
     assert len(made) == (2 if name == "individual" else 1)
     for checkpoint in made.values():
         assert np.isfinite(checkpoint.card.get("validation_loss", 0.0)).all()

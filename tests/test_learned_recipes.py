@@ -95,7 +95,7 @@ def test_files_that_are_no_checkpoint_are_refused(tmp_path):
 @pytest.mark.usefixtures("quick")
 def test_train_all_makes_every_recipe_and_resumes(tmp_path):
     fleet = drives()
-    made = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"), progress=False)
+    made = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"))
     names = {*recipes.RECIPES, "individual1", "individual2"} - {"individual"}
     assert set(made) == {f"{n}-{start}-axis-{seed}" for n in names for start in ("gnss", "true") for seed in (0, 1)}
     card = made["fedkalmannet-true-axis-1"].card
@@ -104,7 +104,7 @@ def test_train_all_makes_every_recipe_and_resumes(tmp_path):
     assert [row["round"] for row in card["history"]] == [0, 1, 2]
 
     stamps = {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()}
-    again = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"), progress=False)
+    again = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"))
     assert {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == stamps
     first, second = (flatten([d["centralised-gnss-axis-0"].model]) for d in (made, again))  # type: ignore[list-item]
     assert torch.equal(first, second)
@@ -113,12 +113,12 @@ def test_train_all_makes_every_recipe_and_resumes(tmp_path):
 @pytest.mark.usefixtures("quick")
 def test_what_changes_the_weights_changes_the_key(tmp_path, monkeypatch):
     fleet = drives()
-    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
+    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
     (path,) = tmp_path.iterdir()
     before = read_card(path)["key"]
     faster = replace(recipes.RECIPES["centralised"], schedule=Schedule(epochs=3, batch=2, checks=2, learning_rate=2e-3))
     monkeypatch.setitem(recipes.RECIPES, "centralised", faster)
-    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
+    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
     assert read_card(path)["key"] != before
 
 
@@ -142,7 +142,7 @@ def test_a_recipe_names_what_is_wrong_in_its_drives(monkeypatch):
 
 @pytest.mark.usefixtures("quick")
 def test_a_trained_net_is_a_method(tmp_path):
-    train_all(drives(), tmp_path, seeds=[0], recipes=["individual"], progress=False)
+    train_all(drives(), tmp_path, seeds=[0], recipes=["individual"])
     method = load_method(tmp_path / "individual2-gnss-axis-0.safetensors")
     assert isinstance(method, LearnedGain)
     assert method.name == "individual"

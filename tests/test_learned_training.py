@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import refused, winding
+from conftest import refused, winding, without
 
 import coopoc.learned.training.fit as train
 from coopoc import Fleet, Sensors
@@ -22,8 +22,7 @@ QUICK = Schedule(epochs=6, batch=2, checks=3)
 def drives(lengths: tuple[int, ...] = (130, 260)) -> Fleet:
     """Drives of these lengths, absent afterwards."""
     fleet = winding(max(lengths), 9.0, 4.0, len(lengths))
-    gone = np.arange(len(fleet.t))[:, None, None] >= np.array(lengths)[:, None]
-    return replace(fleet, **{name: np.where(gone, np.nan, getattr(fleet, name)) for name in ("position", "velocity")})
+    return without(fleet, *((slice(length, None), k) for k, length in enumerate(lengths)))
 
 
 def test_pieces_as_in_the_paper():

@@ -3,13 +3,11 @@
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from shell import ran
+from shell import ROOT, TUTORIALS, python
 
-ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"\]\(<?([^)<>\s]+)>?(?:\s[^)]*)?\)|^\[[^\]]+\]:\s+(\S+)|(?:src|href)=\"([^\"]+)\"", re.MULTILINE)
 CODE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 
@@ -55,8 +53,7 @@ def test_every_relative_link_leads_to_a_tracked_file():
     pages = [name for name in there if name.endswith(".md")]
     assert len(pages) > 20
     assert [link for page in sorted(pages) for link in broken(page, (ROOT / page).read_text(), there)] == []
-    sources = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
-    for path in sources:
+    for path in TUTORIALS:
         text = re.sub(r"^# ?", "", path.read_text(), flags=re.MULTILINE)
         assert broken(str(path.relative_to(ROOT)), text, there) == []
 
@@ -64,21 +61,19 @@ def test_every_relative_link_leads_to_a_tracked_file():
 def test_links_to_sources_lead_to_the_made_pages_of_the_site():
     pytest.importorskip("mkdocs")
     code = "import pages; print(pages.on_page_markdown('[a](tutorials/solve.py) [b](../studies) [c](learned.md)'))"
-    out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
-    assert out.stdout == "[a](tutorials/solve.md) [b](gallery.md) [c](learned.md)\n"
+    out = python("-c", code, cwd=ROOT / "docs")
+    assert out == "[a](tutorials/solve.md) [b](gallery.md) [c](learned.md)\n"
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "docs" / "tutorials").glob("*.py")), ids=lambda path: path.stem)
-def test_a_notebook_is_valid_and_has_the_cells_that_the_page_runs(path):
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_a_notebook_is_valid_and_has_the_cells_that_the_page_runs(path, monkeypatch):
     """Independent check: nbformat's schema, and the cells as `page` cuts them; `make docs` runs these."""
     pytest.importorskip("jupytext")
     import nbformat
 
-    sys.path.insert(0, str(ROOT / "docs"))
-    try:
-        from tutorial import CELL, LINE_OF_TEXT, notebook
-    finally:
-        sys.path.pop(0)
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    from tutorial import CELL, LINE_OF_TEXT, notebook
+
     made = notebook(path.read_text())
     assert made == notebook(path.read_text())
     read = nbformat.reads(made, as_version=4)

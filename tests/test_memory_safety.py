@@ -7,13 +7,12 @@ from pathlib import Path
 import corrupted
 import numpy as np
 import pytest
-from conftest import refused
-from shell import ran
+from conftest import refused, standing
+from shell import python, ran
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Sensors, observe
+from coopoc import V2X, InputError, JointFilter, Sensors, observe
 
 KERNELS = ("kalman", "lkf-sa", "msmv-r", "joint", "ci", "batch-smoother")
-FLEET = Fleet(("a", "b"), [0, 0.1], np.tile([[0, 0, 0], [9, 0, 0]], (2, 1, 1)), np.zeros((2, 2, 3)))
 
 
 @pytest.mark.parametrize("whole", [True, False], ids=["complete", "with gaps"])
@@ -74,7 +73,7 @@ def test_whole_numbers_are_as_good_as_floats():
     given = Sensors(gnss_std=[2, 2, 2], range_std=1, min_range=2, gnss_drift_time=np.int64(9))  # type: ignore[arg-type]
     assert isinstance(given.min_range, float)
     assert given == Sensors((2.0,) * 3, range_std=1.0, min_range=2.0, gnss_drift_time=9.0)
-    seen = observe(FLEET, given, V2X(radius=30, rate=10, latency=0), runs=np.int64(2))  # type: ignore[arg-type]
+    seen = observe(standing([[0, 0, 0], [9, 0, 0]]), given, V2X(radius=30, rate=10, latency=0), runs=np.int64(2))  # type: ignore[arg-type]
     assert JointFilter()(seen, [0]).x.shape == (2, 2, 1, 3)
 
 
@@ -109,7 +108,5 @@ for which, (name, last) in enumerate((("copied", 2), ("plain", 11))):
 
 def test_under_the_switch_scalar_and_vector_access_is_checked():
     """NUMBA_BOUNDSCHECK=1 holds for the intrinsics, which work on pointers, too."""
-    command = [sys.executable, "-c", CODE]
-    env = {**os.environ, "NUMBA_BOUNDSCHECK": "1"}
-    done = ran(command, check=True, env=env)
-    assert done.stdout.split("\n")[:-1] == ["copied checks", "plain checks"]
+    said = python("-c", CODE, env={**os.environ, "NUMBA_BOUNDSCHECK": "1"})
+    assert said.split("\n")[:-1] == ["copied checks", "plain checks"]

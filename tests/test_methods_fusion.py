@@ -1,11 +1,10 @@
 """CovarianceIntersection and QCQPRelaxation over a Recording: consistency, laws and real channels."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from qcqp_relaxation import QCQPRelaxation
 
 import coopoc as co
 from coopoc import V2X, Fleet, NoiseModel, Sensors, observe
@@ -15,7 +14,6 @@ from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.star import stars
-from coopoc.plugins import from_file
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()
@@ -26,7 +24,6 @@ FILTERS = [
     CovarianceIntersection("identity"),
     replace(SPLIT, noise_model="identity"),
 ]
-QCQPRelaxation: Any = from_file(f"{Path(__file__).parents[1] / 'examples' / 'qcqp_relaxation.py'}:QCQPRelaxation")
 SNAPSHOTS = [QCQPRelaxation(), QCQPRelaxation("identity")]
 METHODS = [*FILTERS, *SNAPSHOTS]
 
@@ -72,7 +69,7 @@ def brief(method: object, fleet: Fleet) -> Fleet:
 def test_bytes_by_closed_form(method, crossing):
     """One message per link and step: 14 numbers for an estimate with its covariance, 8 for a fix."""
     fleet = brief(method, crossing)
-    recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=10), runs=1)
+    recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=10))
     numbers = 14 if method in FILTERS else 8
     track = method(recording, [1])
     assert (track.received_bytes == len(recording.links.of(1)) * (4 * numbers + 10)).all()
@@ -83,7 +80,7 @@ def test_bytes_by_closed_form(method, crossing):
 def test_what_has_not_arrived_is_not_used(method, crossing):
     """Poison: what the others measured at steps whose messages the inbox never yields changes nothing. An estimate
     remembers all fixes before it: there, those after the last message that is used."""
-    recording = observe(crossing, S2, V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3), runs=1)
+    recording = observe(crossing, S2, V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3))
     box = inbox(recording, 0, method.message)
     who = recording.links.neighbour[box.link]
     received = {(int(s), int(j)) for s, j in zip(box.newest[0], who, strict=True) if s >= 0}

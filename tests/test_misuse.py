@@ -89,8 +89,8 @@ METHODS: tuple[Any, ...] = (
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
-RECORDING = co.observe(FLEET, SENSORS, CHANNEL, runs=1, seed=0)
-TRACK = co.Kalman("nominal")(RECORDING, [0, 1])
+RECORDING = co.observe(FLEET, SENSORS, CHANNEL)
+TRACK = co.Kalman()(RECORDING, [0, 1])
 
 
 def ours(call: Callable[[], object], what: str) -> None:
@@ -386,9 +386,9 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path):
         swept(lambda path, read=read: read(path), {"path": "nowhere.pyfg"})
     for value in (None, 1, [], b"x"):
         with refused("study"):
-            co.run_study(value, tmp_path, progress=False)  # type: ignore[arg-type]
+            co.run_study(value, tmp_path)  # type: ignore[arg-type]
         with refused("path"):
-            co.run_study("neighbours", value, progress=False)  # type: ignore[arg-type]
+            co.run_study("neighbours", value)  # type: ignore[arg-type]
 
 
 def test_a_duration_and_a_mask_are_no_numbers():

@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles.pace import heard
+from oracles.solo import filterpys
 
 from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.methods.catalogue import METHODS
@@ -85,9 +85,7 @@ def test_the_pace_of_a_step_does_not_know_its_velocity():
 def test_it_is_filterpys_filter_with_the_noise_of_the_pace():
     seen = road()[1]
     track, q = Kalman(robust=False)(seen, [1]), heard(seen, None, NoiseModel.nominal(NOISY), 7, 1)
-    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    peer.x, peer.P, peer.R = seen.gnss[7, 0, 1], 3.5**2 * np.eye(3), 3.5**2 * np.eye(3)
-    peer.F, peer.H, peer.B = np.eye(3), np.eye(3), np.eye(3)
+    peer = filterpys(seen.gnss[7, 0, 1], 3.5**2 * np.eye(3), 1.0)
     for t in range(1, 60):
         peer.predict(u=seen.velocity[7, t, 1], Q=np.diag(q[t, 1]))
         peer.update(seen.gnss[7, t, 1])

@@ -89,10 +89,10 @@ def test_estimates_stay_sane_where_digits_are_few(fleet, sensors):
 def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_the_track_says_so():
     """Least std (3e-7 x 800 m x 1 m)^(1/2), with the range's 1 m: finer ones made the joint covariance negative."""
     fleet, sensors = in_line(4, 10.0), co.Sensors(gnss_std=(800.0, 2.0, 0.02), azimuth_std=1.5e-6, inclination_std=6e-6)
-    track = co.JointFilter("nominal")(observed(fleet, sensors), [0])
+    track = co.JointFilter()(observed(fleet, sensors), [0])
     assert any("at least 0.015 m and rad" in note for note in track.notes)
     assert (np.linalg.eigvalsh(track.covariance) > 0.0).all()
-    usual = co.JointFilter("nominal")(observed(fleet, co.Sensors()), [0])
+    usual = co.JointFilter()(observed(fleet, co.Sensors()), [0])
     assert not usual.notes
 
 
@@ -119,7 +119,7 @@ def test_the_smoother_descends_where_whole_steps_lead_away():
         inclination_std=6e-4,
     )
     recording = observed(fleet, sensors, 6, 13)
-    settled = co.BatchSmoother("nominal")(recording, [0]).x
+    settled = co.BatchSmoother()(recording, [0]).x
     error = np.linalg.norm(settled[:, :, 0] - fleet.position[:, 0], axis=-1)
     assert error.max() < 3.0 * np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
 
@@ -196,8 +196,6 @@ def test_an_estimate_that_its_fixes_contradict_is_noted():
     """Ranges fifty times as long as stated move the estimate away from the ego's fixes, which a note reports."""
     seen = observed(in_line(4, 10.0), co.Sensors())
     wrong = replace(seen, relative=seen.relative * [50.0, 1.0, 1.0])
-    for method in (textbook(co.JointFilter()),):
-        assert not any("fixes, " in note for note in method(seen, [0]).notes)
-        assert any(
-            "far from its estimates; it is lost, or rejects them (0 to " in n for n in method(wrong, [0]).notes
-        ), method.name
+    method = textbook(co.JointFilter())
+    assert not any("fixes, " in note for note in method(seen, [0]).notes)
+    assert any("far from its estimates; it is lost, or rejects them (0 to " in n for n in method(wrong, [0]).notes)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import among, refused
 
 from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors, observe
 from coopoc.world.faults import episodes
@@ -123,11 +123,7 @@ def test_draws_are_keyed_by_what_they_belong_to(crossing):
     assert np.array_equal(shorter.gnss, base.gnss[:2, :30], equal_nan=True)
     assert np.array_equal(shorter.velocity, base.velocity[:2, :30])
     few = observe(crossing, replace(S2, outliers=ALL), V2X(max_neighbours=2), runs=5)
-    rows = {
-        key: k for k, key in enumerate(zip(base.links.step, base.links.observer, base.links.neighbour, strict=True))
-    }
-    same = [rows[key] for key in zip(few.links.step, few.links.observer, few.links.neighbour, strict=True)]
-    assert np.array_equal(few.relative, base.relative[:, same])
+    assert np.array_equal(few.relative, base.relative[:, among(base.links, few.links)])
     only = seen(crossing, Outliers(ranges=ALL.ranges), runs=5)
     assert np.array_equal(only.relative[..., 0], base.relative[..., 0])
 

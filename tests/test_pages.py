@@ -2,14 +2,12 @@
 
 import os
 import re
-import sys
 from itertools import zip_longest
 from pathlib import Path
 
 import pytest
-from shell import ran
+from shell import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[1]
 HERE = ["README", "index", "methods", "optimize", "streaming", "studies", "learned"]
 HERE += ["federation", "budget", "robustness", "heading_error"]
 ELSEWHERE = {"extend": "test_extend.py", "your_data": "test_your_data.py"}
@@ -32,9 +30,7 @@ def printed(page: str, folder: Path) -> str:
     (folder / "page.py").write_text("\n".join(code for code, _ in blocks(page)))
     flags = ["-W", "error", "-W", "ignore:'click.utils"]  # of a library that Flower imports
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "examples")}
-    done = ran([sys.executable, *flags, "page.py"], cwd=folder, env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return python(*flags, "page.py", cwd=folder, env=environment)
 
 
 def agree(shown: str, found: str) -> bool:

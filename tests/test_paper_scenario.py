@@ -1,15 +1,15 @@
 """The README's table by a simulation that shares no code with the toolkit, on the fleet's arrays alone."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from oracles.paper_scenario import simulate
+from shell import ROOT
 
 import coopoc as co
 
-REFERENCE = Path(__file__).resolve().parents[1] / "studies" / "reference" / "neighbours.json"
+REFERENCE = ROOT / "studies" / "reference" / "neighbours.json"
 METHODS = (("gnss", "none"), ("lkf-sa", "identity"), ("joint", "nominal"))
 
 

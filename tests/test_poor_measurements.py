@@ -48,7 +48,7 @@ def test_missing_fixes_cost_and_do_not_crash(crossing, method):  # type: ignore[
 
 
 def test_a_drive_starts_with_a_fix(crossing):
-    seen = observe(crossing, Sensors(), V2X(0), runs=1)
+    seen = observe(crossing, Sensors(), V2X(0))
     gnss = seen.gnss.copy()
     gnss[:, 0] = np.nan
     absent = Kalman()(replace(seen, gnss=gnss), [0]).absent

@@ -1,18 +1,16 @@
 """Pose filters against a dense oracle, filterpy, GTSAM, the position filter; streams against Tracks."""
 
 import os
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import refused, textbook
+from conftest import refused, textbook, without
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import pose_filter as oracle
 from oracles.pace import heard
-from shell import ran
+from shell import ROOT, python
 
 import coopoc as co
 from coopoc.methods.poses.pose_inputs import pose_measurements, pose_noise, to_landmarks
@@ -55,10 +53,7 @@ def with_masts(fleet: co.Fleet) -> co.Fleet:
 @pytest.fixture(scope="module")
 def rough(crossing):
     """Vehicle 1 is away for a while, vehicle 2 comes late."""
-    position, velocity = crossing.position.copy(), crossing.velocity.copy()
-    for column, away in ((1, slice(25, 30)), (2, slice(0, 10))):
-        position[away, column] = velocity[away, column] = np.nan
-    fleet, marks = with_masts(replace(crossing, position=position, velocity=velocity)), ["mast", "tower"]
+    fleet, marks = with_masts(without(crossing, (slice(25, 30), 1), (slice(10), 2))), ["mast", "tower"]
     return with_gaps(co.observe(fleet, NOISE, LATE, runs=2, seed=4, frame="body", landmarks=marks))
 
 
@@ -156,15 +151,6 @@ def test_it_is_as_good_as_the_dense_iterated_filter(crossing):
     assert ours < 1.02 * theirs
 
 
-def lone(steps: int = 12) -> co.Fleet:
-    """A vehicle on a circle with a landmark at its side."""
-    t = np.arange(steps) * 0.1
-    way = np.c_[10 * np.sin(t), 10 - 10 * np.cos(t), 0 * t]
-    position = np.c_[way, np.broadcast_to([3.0, 4.0, 0.0], way.shape)]
-    velocity = np.diff(position, axis=0, prepend=position[:1]) / 0.1
-    return co.Fleet(("a", "mast"), t, position, velocity, heading=np.c_[t, 0 * t])
-
-
 def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:
     """What a vehicle measured of itself at a step."""
     rate, heading = (values[run, t, column] for values in (recording.body.yaw_rate, recording.body.heading))
@@ -216,7 +202,6 @@ def test_mistakes_of_streams_are_named(make, words):
 @pytest.mark.slow
 def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path):
     """numba's bounds checks, over members that come and go, in a process of its own."""
-    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
+    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = ran(words, env=env, cwd=Path(__file__).parents[1])
-    assert done.returncode == 0, done.stdout[-2000:]
+    python(*words, env=env, cwd=ROOT)

@@ -1,11 +1,10 @@
 """docs/reliability.md names tests that exist, and docs/oracles.md is what the tests say."""
 
 import re
-from pathlib import Path
 
-from oracle_page import page
+from oracle_page import PAGE, TESTS, page
 
-TESTS, DOCS = Path(__file__).parent, Path(__file__).resolve().parents[1] / "docs"
+DOCS = PAGE.parent
 
 
 def test_every_fault_of_the_page_has_its_test():

@@ -1,9 +1,7 @@
 """The report: one file, nothing outside it, everything that must be said."""
 
-import importlib
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 from conftest import refused
@@ -45,13 +43,10 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def made(study, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     (out / "trouble").write_text("raise")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
-        study = importlib.import_module("small_study").STUDY
-        run_study(study, out, settings={"trouble": str(out / "trouble")}, progress=False)
+    run_study(study, out, settings={"trouble": str(out / "trouble")})
     cards = {"circle": {"vehicles": 5, "licence": "<none> & free"}}
     path = report([out / "small"], out / "page" / "report.html", "Circles & <more>", ["A lead."], cards)
     return path, Page(path.read_text())

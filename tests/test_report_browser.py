@@ -1,10 +1,8 @@
 """The page of a real study in headless Chromium: it works offline, sorts, switches, and fits a desk and a phone."""
 
-import importlib
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -39,13 +37,9 @@ def _wide(results: Results) -> Table:
 
 
 @pytest.fixture(scope="module")
-def page_file(tmp_path_factory):
+def page_file(study, tmp_path_factory):
     out = tmp_path_factory.mktemp("browser")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
-        small = importlib.import_module("small_study").STUDY
-    study = replace(small, tables={"numbers": _numbers, "wide": _wide, **small.tables})
-    run_study(study, out, progress=False)
+    run_study(replace(study, tables={"numbers": _numbers, "wide": _wide, **study.tables}), out)
     return report([out / "small"], out / "report.html", cards={"circle": {"vehicles": 5, "name": "a" * 120}})
 
 

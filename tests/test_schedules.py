@@ -4,18 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import refused, standing
 
 from coopoc import LKFSA, V2X, Fleet, JointFilter, Recording, Sensors, observe
 from coopoc.world.inbox import inbox, within_cap
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 S2 = Sensors.paper_scenario2()
-
-
-def still(places: list[list[float]], steps: int = 20) -> Fleet:
-    place = np.broadcast_to(np.array(places, dtype=float), (steps, len(places), 3))
-    return Fleet(tuple(f"s{i}" for i in range(len(places))), np.arange(steps) * 0.1, place, 0 * place)
 
 
 def received_steps(fleet: Fleet, **given: float) -> list[int]:
@@ -26,7 +21,7 @@ def received_steps(fleet: Fleet, **given: float) -> list[int]:
 
 def test_the_token_bucket_by_hand():
     """100 B/s: 100 at first, 10 more a step, 32 for a message; what is left after each is 68, 46, 24, 2, 0, 8, ..."""
-    pair = still([[0, 0, 0], [9, 0, 0]])
+    pair = standing([[0, 0, 0], [9, 0, 0]], 20)
     assert received_steps(pair, bytes_per_second=100.0) == [0, 1, 2, 3, 6, 10, 13, 16, 19]
     assert received_steps(pair, bytes_per_second=20.0) == [
         0,

@@ -52,7 +52,7 @@ STUDY = Study(
 @pytest.fixture
 def folder(tmp_path):
     """A folder in which STUDY has run."""
-    run_study(STUDY, tmp_path, progress=False)
+    run_study(STUDY, tmp_path)
     return tmp_path / "made"
 
 
@@ -112,7 +112,7 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(tmp_path, capsys):
         "OTHER = Study('other', '?', cell, {'x': (1.0,)}, **known)\n"
     )
     mine, out = f"{tmp_path / 'mine.py'}:STUDY", str(tmp_path / "mine")
-    run_study(mine, tmp_path, progress=False)
+    run_study(mine, tmp_path)
     given = ["reference", out]
     assert status(*given, "--write") == 2
     assert "is not installed. If it is a file of your own, name it: coopoc reference" in capsys.readouterr().err
@@ -171,7 +171,7 @@ def test_views_show_and_remove_no_file_outside_their_folder(folder, kind, name):
         report([folder], folder.parent / "report.html")
     with refused("must be a file name"):
         tables(folder)
-    run_study(STUDY, folder.parent, progress=False)  # writes the views again; those of before are removed
+    run_study(STUDY, folder.parent)  # writes the views again; those of before are removed
     assert all(secret.read_text() == "secret" for secret in secrets)
     assert [view["name"] for view in views(folder)["tables"]] == ["rt_le"]
 
@@ -200,7 +200,7 @@ def test_a_description_of_another_form_is_named_and_written_again(folder, name, 
     }[name]
     with refused(rf"holds a damaged {name} .*Repeat coopoc run: finished cells are kept"):
         read()
-    assert run_study(STUDY, folder.parent, progress=False).failed == 0
+    assert run_study(STUDY, folder.parent).failed == 0
     read()
 
 
@@ -238,7 +238,7 @@ def test_a_flipped_bit_is_noticed(tmp_path):
         draws = np.random.default_rng(0).normal(size=(40, 20))
         return [{"run": r, "ego": "a", "rt_le_m": float(d[0]), "quantiles": d.tolist()} for r, d in enumerate(draws)]
 
-    run_study(Study("noise", "?", noise, {"x": (1,)}), tmp_path, progress=False)
+    run_study(Study("noise", "?", noise, {"x": (1,)}), tmp_path)
     (path,) = (tmp_path / "noise" / "cells").iterdir()
     content = path.read_bytes()
     seal = content.rindex(b"sha256:")

@@ -27,7 +27,7 @@ def one_line(result: object) -> str:
 @pytest.fixture(scope="module")
 def recording():
     fleet = co.load_fleet("town10").between(0, 60)
-    return co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(max_neighbours=6), runs=8, seed=0, observers=[24])
+    return co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(max_neighbours=6), runs=8, observers=[24])
 
 
 def test_tracks_and_methods_show_their_sizes(recording):

@@ -1,14 +1,10 @@
 """The site: every page has a place, and the tutorials run as they stand."""
 
 import re
-import sys
-from pathlib import Path
 
 import pytest
-from shell import ran
+from shell import ROOT, TUTORIALS, python
 
-ROOT = Path(__file__).resolve().parents[1]
-TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 SLOW = ("learned", "compare", "paper")
 
 
@@ -21,8 +17,8 @@ def test_every_page_has_a_place():
 def test_every_study_has_a_finding_and_a_page_that_is_there():
     pytest.importorskip("mkdocs", reason="make docs installs it")
     code = "import pages; print(len(pages.names('coopoc.studies')), pages._gallery())"
-    out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
-    title, *studies = out.stdout.split("\n## ")
+    out = python("-c", code, cwd=ROOT / "docs")
+    title, *studies = out.split("\n## ")
     for study in studies:
         assert "**" in study, study
         page, _, place = re.findall(r"\[\w+\]\(([\w.]+)(#?)([\w-]*)\)", study)[0]
@@ -52,11 +48,10 @@ def test_every_method_has_a_row_of_its_own_in_the_overview():
     ids=lambda path: path.stem,
 )
 def test_a_tutorial_runs(tutorial, tmp_path):
-    done = ran([sys.executable, "-W", "error", tutorial], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
+    out = python("-W", "error", tutorial, cwd=tmp_path)
+    assert out
     if tutorial.stem == "paper":
-        says_what_it_prints(done.stdout)
+        says_what_it_prints(out)
 
 
 def says_what_it_prints(printed: str) -> None:
@@ -71,15 +66,13 @@ def says_what_it_prints(printed: str) -> None:
     assert rows["joint filter, nominal"][4] < 1.1 * rows["bound"][4]
 
 
-def test_doctests_and_tutorials_of_pages(capsys):
+def test_doctests_and_tutorials_of_pages(monkeypatch):
     """What the package does not contain: the extension of the API pages, and what a tutorial becomes."""
     pytest.importorskip("griffe", reason="make docs installs it")
-    sys.path.insert(0, str(ROOT / "docs"))
-    try:
-        from doctests import fenced
-        from tutorial import page
-    finally:
-        sys.path.pop(0)
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    from doctests import fenced
+    from tutorial import page
+
     assert fenced("Words.\n\n>>> 1 + 1\n2") == "Words.\n\n```pycon\n>>> 1 + 1\n2\n```"
     cells = "# %% [markdown]\n# # A [sum](../learned.md)\n#\n#     more\n\n# %%\nprint(3)\n1 + 1\n\n# %%\n"
     drawn = "import sys\nimport matplotlib.pyplot as plt\nprint('compiling', file=sys.stderr)\n_ = plt.plot([1, 2])\n"
@@ -102,5 +95,5 @@ try:
 except pages.PluginError:
     print("refused")
 """
-    out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
-    assert out.stdout.split() == ["1", "refused"]
+    out = python("-c", code, cwd=ROOT / "docs")
+    assert out.split() == ["1", "refused"]

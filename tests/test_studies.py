@@ -18,7 +18,7 @@ from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain
 from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
-from coopoc.learned.recipes import Setting, jobs_of, load_method
+from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of, load_method
 from coopoc.plugins import find
 from coopoc.studies import convergence, error_cdf, lineup, scene, weights
 from coopoc.studies.paper import reported
@@ -28,7 +28,6 @@ from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Study
 
-WEIGHTS = Path(__file__).resolve().parents[1] / "learned" / "weights"
 CLASSIC = {"method": "gnss,kalman,lkf-sa,joint,bound", "runs": 4, "egos": "2", "max_neighbours": "0,2,6"}
 
 
@@ -56,7 +55,7 @@ def test_the_clients_are_drawn_where_they_drive():
 
 def test_neighbours_runs_without_any_training(tmp_path):
     """Only what is asked for is made: no weights for classical methods, and views of what was run."""
-    results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)
+    results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path)
     assert results.failed == 0
     assert not (tmp_path / "weights").exists()
     bound = [results.interval("rt_le_m", method="bound", max_neighbours=k).mean for k in (0, 2, 6)]
@@ -186,7 +185,7 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10):
             co.GNSS(),
             load_method("fedkalmannet"),
             co.LKFSA("identity"),
-            co.JointFilter("nominal"),
+            co.JointFilter(),
         ):
             each = rt_le(method(seen, egos), town10)
             assert (each < 7.0).all()

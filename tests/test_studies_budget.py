@@ -24,7 +24,7 @@ SIZES = ("payload_bytes_per_second", "bytes_per_second")
 @pytest.fixture(scope="module")
 def results(tmp_path_factory, short_town):
     wanted = {**QUICK, "data": short_town}
-    return run_study("budget", tmp_path_factory.mktemp("budget"), settings=wanted, progress=False)
+    return run_study("budget", tmp_path_factory.mktemp("budget"), settings=wanted)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def tight(tmp_path_factory, short_town):
         "weights": str(folder),
         "train_seeds": 1,
     }
-    return run_study("budget", tmp_path_factory.mktemp("tight"), settings=wanted, progress=False)
+    return run_study("budget", tmp_path_factory.mktemp("tight"), settings=wanted)
 
 
 def rows(table: Table | None) -> list[tuple[object, ...]]:

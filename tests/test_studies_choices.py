@@ -1,9 +1,8 @@
 """Studies of choices on few cells: aggregation rules, any methods side by side."""
 
-import sys
-from pathlib import Path
 from typing import Any
 
+import aggregation
 import pandas as pd
 import pytest
 import torch
@@ -13,27 +12,23 @@ import coopoc as co
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import GainNet
 from coopoc.learned.federation.federate import federate
-from coopoc.plugins import from_file
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
 
-FILE = Path(__file__).parents[1] / "examples" / "aggregation.py"
-aggregation = sys.modules[from_file(f"{FILE}:STUDY").cell.__module__]
 TWO = {"egos": "2", "runs": 2}
 
 
 @pytest.mark.slow
 def test_side_by_side_takes_any_methods_and_conditions(tmp_path, short_town):
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
-    results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,bound"}, progress=False)
+    results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,bound"})
     caption = (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
     assert "With latency_s 0.2, common_share 0.5." in caption
     mild = run_study(
         "side_by_side",
         tmp_path / "mild",
         settings={**harsh, "method": "joint", "latency_s": None, "common_share": 0.0},
-        progress=False,
     )
     where = {"method": "joint", "max_neighbours": 4}
     assert results.values("rt_le_m", where).mean() > mild.values("rt_le_m", where).mean()
@@ -46,7 +41,7 @@ def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path, short
         ({"runs": 0}, r"runs = 0: must be >= 1"),
     ):
         with refused(said):
-            run_study("side_by_side", tmp_path, settings={"data": short_town, **wrong}, progress=False)
+            run_study("side_by_side", tmp_path, settings={"data": short_town, **wrong})
     assert not (tmp_path / "side_by_side").exists()
 
 
@@ -111,7 +106,7 @@ def test_a_cell_is_the_federation_of_its_seed():
 def test_the_study_runs_and_says_what_it_found(tmp_path):
     wanted = {**TINY, "runs": 1, "method": "mean,centralised,kalman,bound", "condition": "iid,poisoned update"}
     study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
-    results = run_study(study, out=tmp_path, progress=False)
+    results = run_study(study, out=tmp_path)
     assert results.failed == 0
     shown = published(tmp_path / "aggregation")
     assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]

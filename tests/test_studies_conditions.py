@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import formation_fleet, refused
+from test_study_figures import FILES
 
 import coopoc as co
 from coopoc import Sensors, run_study
 from coopoc.studies import conditions as study
 from coopoc.studies import scene
 from coopoc.study import numbers
-
-FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
 
 
 def conditions(file: Path) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], dict[str, Any]]]]:
@@ -59,7 +58,7 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path, short_town)
         "latency_s": "0.0,0.3",
         "loss": "0.0,0.6",
     }
-    results = run_study("latency_loss", tmp_path, settings=wanted, progress=False)
+    results = run_study("latency_loss", tmp_path, settings=wanted)
     perfect, late, lossy = (
         numbers.mean(results, {**study.PERFECT, "method": "joint", **change}) or np.nan
         for change in ({}, {"latency_s": 0.3}, {"loss": 0.6})
@@ -82,7 +81,7 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path, short_town):
         "spoofed_from_s": "0.0",
         "spoofed_collude": "False",
     }
-    results = run_study("robustness", tmp_path, settings=wanted, progress=False)
+    results = run_study("robustness", tmp_path, settings=wanted)
     clean, wild, spoofed = "nothing wrong", "5 % wild fixes", "20 % spoofed"
     error = {
         (method, case): np.array(numbers.mean(results, {"method": method, **study.WRONG[case]}))
@@ -107,7 +106,7 @@ QUICK = {"method": "kalman,joint,cooperative-filter,bound", "max_neighbours": "0
 
 def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path, short_town):
     wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
-    results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
+    results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town})
     value = {
         name: [
             numbers.rms(results, {**study.LASTING[f"{name}, K = {k}"], "method": "cooperative-filter"}) or np.nan

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
+from shell import ROOT
 
 from coopoc.plugins import find
 from coopoc.studies.error_cdf import quantile
@@ -182,7 +183,7 @@ def from_reference(file: Path) -> Results:
 
 
 LAW, ROUNDS = np.sqrt(np.linspace(0, 2, 51)), {"convergence": (0, 10, 20)}
-FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
+FILES = sorted((ROOT / "studies" / "reference").glob("*.json"))
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

@@ -177,7 +177,7 @@ def test_a_caption_or_a_views_name_recomputes_nothing(tmp_path):
     for number, caption, name, finished in ((2, "One", "a", 0), (2, "Two", "b", 2), (3, "Two", "b", 0)):
         file.write_text(FILE.format(number=number, caption=caption, name=name))
         assert plan(study, out)["finished"] == finished
-        results = run_study(study, out, progress=False)
+        results = run_study(study, out)
         assert results.frame["y"].tolist() == [number, 2 * number]
         assert [path.stem for path in (out / "own" / "tables").glob("*.md")] == [name]
         assert caption in (out / "own" / "tables" / f"{name}.md").read_text()
@@ -212,7 +212,7 @@ def no_results() -> Table | None:
 )
 def test_a_view_is_checked_before_the_first_cell(tmp_path, view, message):
     with refused(message):
-        run_study(demo(view), tmp_path, progress=False)
+        run_study(demo(view), tmp_path)
 
 
 def test_names_of_views_are_names_of_files(tmp_path):

@@ -47,7 +47,7 @@ METRICS: dict[str, str | float] = {"rt_le_m": "lower", "nees": 3.0}
 
 @pytest.fixture
 def results(tmp_path):
-    return run_study(STUDY, tmp_path, progress=False)
+    return run_study(STUDY, tmp_path)
 
 
 def verdicts(now: Results, known: Reference) -> dict[tuple[float, str], str]:
@@ -56,7 +56,7 @@ def verdicts(now: Results, known: Reference) -> dict[tuple[float, str], str]:
 
 def changed(tmp_path: Path, **settings: float) -> Results:
     """Rows of other settings, as if the code had changed under the same ones."""
-    now = run_study(STUDY, tmp_path / "now", settings=settings, progress=False)
+    now = run_study(STUDY, tmp_path / "now", settings=settings)
     return replace(now, settings={**STUDY.settings, "runs": now.settings["runs"]})
 
 
@@ -114,7 +114,7 @@ def test_other_runs_are_allowed_their_standard_errors(results, tmp_path):
 
 def test_numbers_of_other_settings_are_refused(results, tmp_path):
     known = measure(results, METRICS)
-    other = run_study(STUDY, tmp_path / "other", settings={"scale": 2.0, "weights": "there"}, progress=False)
+    other = run_study(STUDY, tmp_path / "other", settings={"scale": 2.0, "weights": "there"})
     with refused(r"is not the reference's in scale\. Run it with its own settings"):
         check(other, known)
 
@@ -138,7 +138,7 @@ def test_every_study_that_names_metrics_has_numbers_of_its_own_settings():
 @pytest.mark.parametrize("name", CHEAP)
 def test_committed_numbers_come_out_again(name, tmp_path):
     study: Study = find("coopoc.studies", name)
-    results = run_study(study, tmp_path, settings=CHEAP[name], progress=False)
+    results = run_study(study, tmp_path, settings=CHEAP[name])
     assert results.failed == 0
     assert study.reference is not None
     found = check(results, Reference.load(study.reference))

@@ -1,7 +1,6 @@
 """Results and tables: means against pandas, what must not be mixed, tables in every format."""
 
 import json
-from html.parser import HTMLParser
 
 import numpy as np
 import pandas as pd
@@ -9,6 +8,7 @@ import pytest
 from conftest import refused
 from latex import compiled
 from numpy.testing import assert_array_equal
+from test_report import Page
 
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.results import Results, parsed
@@ -196,18 +196,8 @@ def test_csv_keeps_every_digit_and_the_interval():
 
 
 def test_html_is_well_formed_and_escaped():
-    opened: list[str] = []
-
-    class Checker(HTMLParser):
-        def handle_starttag(self, tag: str, attrs: object) -> None:
-            opened.append(tag)
-
-        def handle_endtag(self, tag: str) -> None:
-            assert opened.pop() == tag
-
     html = TABLE.to_html()
-    Checker().feed(html)
-    assert opened == []
+    assert Page(html).open == []
     assert "KF &amp; co" in html
     assert "<strong>0.80</strong>" in html
 

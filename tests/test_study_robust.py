@@ -22,7 +22,7 @@ from coopoc.study.study import Params, Row
 def test_ten_kills_at_random_moments_change_nothing(study, tmp_path):
     """Thirty cells; each process goes on where the one before was killed: at its start, in a cell, or in a file."""
     settings = {"max_neighbours": ",".join(map(str, range(10)))}
-    whole = run_study(study, tmp_path / "whole", settings=settings, progress=False)
+    whole = run_study(study, tmp_path / "whole", settings=settings)
     rng = np.random.default_rng(6)
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["coopoc.study.run", "coopoc.study.figures"])
@@ -40,7 +40,7 @@ def test_ten_kills_at_random_moments_change_nothing(study, tmp_path):
         assert all(store.load(folder, name.removesuffix(".parquet")) is not None for name in after)
         before = after
     assert len(before) >= 10
-    resumed = run_study(study, tmp_path, settings=settings, progress=False)
+    resumed = run_study(study, tmp_path, settings=settings)
     after = files(folder)
     assert {name: after[name] for name in before} == before
     assert len(after) == 30
@@ -50,7 +50,7 @@ def test_ten_kills_at_random_moments_change_nothing(study, tmp_path):
 
 
 def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(study, tmp_path):
-    run_study(study, tmp_path, progress=False)
+    run_study(study, tmp_path)
     whole = shown(tmp_path / "small")
     process = multiprocessing.get_context("forkserver").Process(
         target=run_study, args=("small", tmp_path, 1, {}, False)
@@ -62,7 +62,7 @@ def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(s
     process.kill()
     process.join()
     (tmp_path / "small/views.json").write_text("")
-    run_study(study, tmp_path, progress=False)
+    run_study(study, tmp_path)
     assert shown(tmp_path / "small") == whole
 
 
@@ -122,7 +122,7 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
     assert 0 < len(kept) < 9
     assert {name: after[name] for name in kept} == kept
     assert not list((tmp_path / "small").glob("failed/*"))
-    run_study(study, tmp_path / "whole", progress=False)
+    run_study(study, tmp_path / "whole")
     assert shown(tmp_path / "small") == shown(tmp_path / "whole/small")
 
 
@@ -133,7 +133,7 @@ def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(s
         return study.cell(params)
 
     with refused(r"lost \d+ of \d+ cells while it ran"):
-        run_study(replace(study, cell=cell), tmp_path, progress=False)
+        run_study(replace(study, cell=cell), tmp_path)
     assert not (tmp_path / "small/tables").exists()
-    whole = run_study(study, tmp_path, progress=False)
+    whole = run_study(study, tmp_path)
     assert whole.pending == 0

@@ -4,7 +4,6 @@ import shutil
 import sys
 from dataclasses import replace
 
-import pandas as pd
 import pytest
 from conftest import refused
 from small_runs import files, numbers, shown
@@ -17,12 +16,12 @@ from coopoc.study.study import Cell, Study
 
 
 def test_two_processes_compute_what_one_computes(study, tmp_path):
-    one = run_study(study, tmp_path / "one", jobs=1, progress=False)
+    one = run_study(study, tmp_path / "one", jobs=1)
     with pytest.MonkeyPatch.context() as before:  # workers that are left over know not where the study is
         before.setattr(sys, "path", [place for place in sys.path if not place.endswith("distribution")])
         assert len(list(compute(repr, [Cell({}, {}, "a"), Cell({}, {}, "b")], 2))) == 2  # type: ignore[arg-type]
-    two = run_study(study, tmp_path / "two", jobs=2, progress=False)
-    pd.testing.assert_frame_equal(numbers(one.frame), numbers(two.frame), check_exact=True)
+    two = run_study(study, tmp_path / "two", jobs=2)
+    assert numbers(one.frame).equals(numbers(two.frame))
     for name in ("tables/rt_le.csv", "tables/rt_le.tex", "figures/rt_le.pdf", "figures/rt_le.png", "figures/rt_le.svg"):
         assert (tmp_path / "one/small" / name).read_bytes() == (tmp_path / "two/small" / name).read_bytes()
 
@@ -31,7 +30,7 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
     changes = {"trouble": str(trouble)}
-    first = run_study(study, tmp_path, settings=changes, progress=False)
+    first = run_study(study, tmp_path, settings=changes)
     assert first.failed == 1
     row = first.failures.iloc[0]
     assert (row["method"], row["max_neighbours"], row["status"]) == ("kalman", 1, "failed")
@@ -41,9 +40,9 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     assert "–" in (tmp_path / "small/tables/rt_le.md").read_text()
     finished, failed = files(tmp_path / "small"), files(tmp_path / "small", "failed")
     trouble.unlink()
-    assert run_study(study, tmp_path, settings=changes, progress=False).failed == 1
+    assert run_study(study, tmp_path, settings=changes).failed == 1
     assert files(tmp_path / "small", "failed") == failed
-    second = run_study(study, tmp_path, settings=changes, progress=False, retry_failed=True)
+    second = run_study(study, tmp_path, settings=changes, retry_failed=True)
     assert second.failed == 0
     assert len(second.frame) == 9 * 2 * 4
     assert not list((tmp_path / "small/failed").iterdir())
@@ -54,7 +53,7 @@ def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study, tmp_pat
     trouble = tmp_path / "trouble"
     trouble.write_text("exit")
     changes = {"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"}
-    results = run_study(study, tmp_path, settings=changes, progress=False)
+    results = run_study(study, tmp_path, settings=changes)
     assert results.frame.empty
     assert set(views(tmp_path / "small")["missing"]) == {"rt_le", "findings"}
 
@@ -65,7 +64,7 @@ def test_a_view_that_fails_is_raised_and_named_beside_the_others(study, tmp_path
 
     wrong = replace(study, figures={"broken": broken, **study.figures})
     with pytest.raises(ZeroDivisionError, match="of the study"):
-        run_study(wrong, tmp_path, settings={"max_neighbours": 0, "method": "kalman"}, progress=False)
+        run_study(wrong, tmp_path, settings={"max_neighbours": 0, "method": "kalman"})
     found = views(tmp_path / "small")
     assert found["missing"] == {"broken": "ZeroDivisionError: of the study"}
     assert len(found["tables"]) == len(study.tables)
@@ -75,36 +74,36 @@ def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study, tmp_path
     trouble = tmp_path / "trouble"
     trouble.write_text("kill")
     with pytest.raises(WorkerDiedError, match="repeat the command"):
-        run_study(study, tmp_path, jobs=2, settings={"trouble": str(trouble)}, progress=False)
+        run_study(study, tmp_path, jobs=2, settings={"trouble": str(trouble)})
     trouble.unlink()
-    assert run_study(study, tmp_path, settings={"trouble": str(trouble)}, progress=False).failed == 0
+    assert run_study(study, tmp_path, settings={"trouble": str(trouble)}).failed == 0
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "of another cell"])
 def test_a_damaged_file_is_computed_again(study, tmp_path, damage):
-    whole = run_study(study, tmp_path, progress=False)
+    whole = run_study(study, tmp_path)
     first, second = sorted((tmp_path / "small/cells").iterdir())[:2]
     content = first.read_bytes()
     bad = {"truncated": content[: len(content) // 2], "empty": b"", "of another cell": second.read_bytes()}[damage]
     first.write_bytes(bad)
     with pytest.warns(RuntimeWarning, match=f"{first.name} is damaged and will be computed again"):
-        again = run_study(study, tmp_path, progress=False)
-    pd.testing.assert_frame_equal(numbers(again.frame), numbers(whole.frame), check_exact=True)
+        again = run_study(study, tmp_path)
+    assert numbers(again.frame).equals(numbers(whole.frame))
 
 
 def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study, tmp_path):
     asked: list[list[int]] = []
     study = replace(study, prepare=lambda cells, jobs: asked.append(sorted({p["max_neighbours"] for p in cells})))
-    run_study(study, tmp_path, settings={"max_neighbours": "0"}, progress=False)
-    run_study(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
-    run_study(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
+    run_study(study, tmp_path, settings={"max_neighbours": "0"})
+    run_study(study, tmp_path, settings={"max_neighbours": "0,2"})
+    run_study(study, tmp_path, settings={"max_neighbours": "0,2"})
     assert asked == [[0], [2]]
 
 
 def test_files_of_cells_may_be_copied_between_folders(study, tmp_path):
     """Half of the cells beside those of other settings; one is damaged, and is computed again as the rest is."""
-    run_study(study, tmp_path / "whole", progress=False)
-    run_study(study, tmp_path / "other", settings={"runs": 2}, progress=False)
+    run_study(study, tmp_path / "whole")
+    run_study(study, tmp_path / "other", settings={"runs": 2})
     cells = tmp_path / "all/small/cells"
     shutil.copytree(tmp_path / "other/small/cells", cells)
     for path in sorted((tmp_path / "whole/small/cells").glob("[!.]*"))[:4]:
@@ -112,7 +111,7 @@ def test_files_of_cells_may_be_copied_between_folders(study, tmp_path):
     assert plan(study, tmp_path / "all")["finished"] == 4
     (cells / path.name).write_bytes(b"")
     with pytest.warns(RuntimeWarning, match="is damaged and will be computed again"):
-        run_study(study, tmp_path / "all", progress=False)
+        run_study(study, tmp_path / "all")
     assert shown(tmp_path / "all/small") == shown(tmp_path / "whole/small")
 
 
@@ -123,9 +122,9 @@ def test_plan_counts_and_writes_nothing(study, tmp_path):
 
 
 def test_changed_settings_compute_anew_and_keep_what_is_there(study, tmp_path):
-    run_study(study, tmp_path, settings={"max_neighbours": 0}, progress=False)
+    run_study(study, tmp_path, settings={"max_neighbours": 0})
     before = files(tmp_path / "small")
-    more = run_study(study, tmp_path, settings={"max_neighbours": 0, "runs": 5}, progress=False)
+    more = run_study(study, tmp_path, settings={"max_neighbours": 0, "runs": 5})
     assert sorted(set(more.frame["run"])) == [0, 1, 2, 3, 4]
     after = files(tmp_path / "small")
     assert len(after) == 6
@@ -141,7 +140,7 @@ def test_bad_input_is_named_before_any_work(study, tmp_path):
         run_study("smal", tmp_path)
     (tmp_path / "file").write_text("")
     with refused("cannot be written"):
-        run_study(study, tmp_path / "file", progress=False)
+        run_study(study, tmp_path / "file")
     assert not (tmp_path / "small").exists()
 
 
@@ -152,7 +151,7 @@ def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path):
         lambda p: {"none": [], "own": [{"x": 1}], "mixed": [{"y": 1}, {"y": "a"}]}[p["x"]],
         {"x": ("none", "own", "mixed")},
     )
-    reasons = list(run_study(study, tmp_path, progress=False).failures["reason"])
+    reasons = list(run_study(study, tmp_path).failures["reason"])
     assert "at least one row" in reasons[0]
     assert "must not repeat a parameter" in reasons[1]
     assert reasons[2].startswith("Arrow")
@@ -173,7 +172,7 @@ def test_a_cell_runs_on_one_thread(tmp_path):
 
         return [{"threads": max(library["num_threads"] for library in threadpool_info())}]
 
-    results = run_study(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1, progress=False)
+    results = run_study(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1)
     assert set(results.frame["threads"]) == {1}
 
 
@@ -193,9 +192,9 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
 
 def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study, tmp_path):
     more = replace(study, tables={**study.tables, "extra": study.tables["rt_le"]})
-    run_study(more, tmp_path, progress=False)
+    run_study(more, tmp_path)
     (tmp_path / "small/tables/mine.md").write_text("by hand")
     assert len(list((tmp_path / "small/tables").glob("extra.*"))) == 4
-    run_study(study, tmp_path, progress=False)
+    run_study(study, tmp_path)
     left = {path.name for path in (tmp_path / "small/tables").iterdir()}
     assert left == {"rt_le.md", "rt_le.csv", "rt_le.tex", "rt_le.html", "mine.md"}

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import among, refused, standing
 from scipy import stats
 
 from coopoc import (
@@ -23,7 +23,7 @@ from coopoc import (
     observe,
 )
 from coopoc.world.channels import lost
-from coopoc.world.inbox import inbox
+from coopoc.world.inbox import Inbox, inbox
 from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.sensors import stream
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -133,11 +133,7 @@ def test_draws_belong_to_their_key(crossing):
     few = observe(crossing, S2, V2X(max_neighbours=2), runs=3, seed=5)
     many = observe(crossing, S2, V2X(max_neighbours=6), runs=5, seed=5)
     assert np.array_equal(few.gnss, many.gnss[:3])
-    key = {
-        (s, o, n): k
-        for k, (s, o, n) in enumerate(zip(many.links.step, many.links.observer, many.links.neighbour, strict=True))
-    }
-    same = [key[row] for row in zip(few.links.step, few.links.observer, few.links.neighbour, strict=True)]
+    same = among(many.links, few.links)
     assert np.array_equal(few.relative, many.relative[:3, same])
     poor = V2X(max_neighbours=6, loss=0.3, burst=3.0, rate=4.0, latency=0.1)
     lossy, fewer = (observe(crossing, S2, replace(poor, max_neighbours=k), runs=r, seed=5) for k, r in ((6, 5), (2, 3)))
@@ -191,19 +187,19 @@ def test_gilbert_elliott_share_and_burst():
 
 def test_loss_delay_and_rate_act_on_messages(formation):
     fleet = formation.between(0, 200)
-    ideal = observe(fleet, S2, V2X(max_neighbours=4), runs=6, observers=[0])
-    box = inbox(ideal, 0, FIX_AND_VELOCITY)
+
+    def box_of(**channel: float) -> Inbox:
+        return inbox(observe(fleet, S2, V2X(4, **channel), runs=6, observers=[0]), 0, FIX_AND_VELOCITY)  # type: ignore[arg-type]
+
+    box, lossy, late, slow = box_of(), box_of(loss=0.3), box_of(latency=0.25), box_of(rate=2.0)
     assert box.fresh.all()
     assert (box.received_bytes == 200 * 4 * 32).all()
     assert box.sent_bytes == 200 * 32
-    lossy = inbox(observe(fleet, S2, V2X(max_neighbours=4, loss=0.3), runs=6, observers=[0]), 0, FIX_AND_VELOCITY)
     assert lossy.received_bytes.mean() == pytest.approx(0.7 * 200 * 4 * 32, rel=0.05)
     assert np.ptp(lossy.received_bytes) > 0
-    late = inbox(observe(fleet, S2, V2X(max_neighbours=4, latency=0.25), runs=1, observers=[0]), 0, FIX_AND_VELOCITY)
-    at = ideal.links.step[late.link]
+    at = np.repeat(np.arange(200), np.diff(late.start))
     assert (late.newest[0, at >= 3] == at[at >= 3] - 3).all()
     assert (late.newest[0, at < 3] == -1).all()
-    slow = inbox(observe(fleet, S2, V2X(max_neighbours=4, rate=2.0), runs=1, observers=[0]), 0, FIX_AND_VELOCITY)
     assert slow.received_bytes[0] == pytest.approx(200 * 4 * 32 / 5, rel=0.05)
     assert slow.fresh.mean() == pytest.approx(0.2, abs=0.02)
 
@@ -257,8 +253,7 @@ def test_what_one_recording_drew_another_shares_and_nobody_keeps(crossing):
 
 def test_a_message_is_held_until_it_is_too_old():
     """By the definition, link by link: the newest message of the sender that has arrived, unless older than max_age."""
-    fleet = Fleet(("a", "b", "c"), np.arange(40) / 10, *np.moveaxis(np.zeros((2, 40, 3, 3)), 0, 0))
-    fleet = replace(fleet, position=fleet.position + np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0]]))
+    fleet = standing([[0, 0, 0], [9, 0, 0], [0, 9, 0]], 40)
     channel = V2X(2, loss=0.6, latency=0.2, max_age=0.5)
     recording = observe(fleet, Sensors(), channel, runs=3, seed=1, observers=[0])
     held, links = inbox(recording, 0, FIX_AND_VELOCITY), recording.links
@@ -276,8 +271,8 @@ def test_a_message_is_held_until_it_is_too_old():
 
 def test_a_range_that_would_be_negative_is_reflected():
     """|d + n| at 3 m with a noise of 10 m: never negative, and its mean is that of a folded normal (SciPy)."""
-    fleet = Fleet(("a", "b"), np.arange(2000) / 10, np.zeros((2000, 2, 3)), np.zeros((2000, 2, 3)))
-    fleet = replace(fleet, position=fleet.position + np.array([[0.0, 0, 0], [3, 0, 0]]))
-    seen = observe(fleet, Sensors(range_std=10.0), V2X(1), runs=5, seed=2, observers=[0])
+    seen = observe(
+        standing([[0, 0, 0], [3, 0, 0]], 2000), Sensors(range_std=10.0), V2X(1), runs=5, seed=2, observers=[0]
+    )
     assert (seen.relative[..., 0] >= 0).all()
     assert seen.relative[..., 0].mean() == pytest.approx(stats.foldnorm(0.3, scale=10.0).mean(), rel=0.03)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused
+from shell import ROOT
 
 import coopoc as co
 from coopoc.cli import _status
@@ -217,7 +218,7 @@ def test_the_command_of_a_worst_world_repeats_its_number(tmp_path, capsys, monke
 def test_nees_and_ratios_are_as_by_hand():
     card = worlds_card.worlds_card("joint", 1, seed=2)
     one = world(2)
-    tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter("nominal"), co.Kalman("nominal"))]
+    tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter(), co.Kalman())]
     joint, alone = (co.rt_le(track, one.fleet).mean() for track in tracks)
     (ratio,) = card["summary"]["over_better"]
     assert ratio == pytest.approx(joint / min(joint, alone), rel=1e-4)
@@ -230,8 +231,7 @@ def test_nees_and_ratios_are_as_by_hand():
 
 def test_the_page_shows_the_committed_cards():
     """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
-    root = Path(__file__).resolve().parents[1]
-    cards = [json.loads(file.read_text()) for file in (root / "benchmarks" / "cards" / "worlds").glob("*.json")]
-    assert worlds_card.overview(cards) in (root / "docs" / "benchmark.md").read_text()
+    cards = [json.loads(file.read_text()) for file in (ROOT / "benchmarks" / "cards" / "worlds").glob("*.json")]
+    assert worlds_card.overview(cards) in (ROOT / "docs" / "benchmark.md").read_text()
     for card in cards:
         assert (card["split"], card["worlds"]["seed"]) == ("test", [*range(1000)])

@@ -1,20 +1,16 @@
 """docs/your_data.md as it stands: its script, its commands and its Python run one by one in an empty folder."""
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from shell import ran
+from shell import ROOT, python
 
 import coopoc as co
 from coopoc.data.log.units import KINDS
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
-COOPOC = [sys.executable, "-W", "error", "-m", "coopoc.cli"]
+PAGE = (ROOT / "docs" / "your_data.md").read_text()
 
 
 def blocks(language: str) -> list[str]:
@@ -31,7 +27,7 @@ def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("page")
     (script,) = [text for text in blocks("python") if text.startswith("# make_log.py\n")]
     (out / "make_log.py").write_text(script)
-    subprocess.run([sys.executable, "-W", "error", "make_log.py"], cwd=out, check=True)
+    python("-W", "error", "make_log.py", cwd=out)
     return out
 
 
@@ -48,11 +44,10 @@ def test_every_command_runs(folder):
     commands = [line for block in blocks("sh") for line in block.splitlines()]
     assert len(commands) == 10
     for command in commands[1:]:
-        done = ran([*COOPOC, *words(command)[1:]], cwd=folder)
-        assert done.returncode == 0, done.stderr
+        out = python("-W", "error", "-m", "coopoc.cli", *words(command)[1:], cwd=folder)
         if "data check" in command:
-            assert "nothing looks wrong" in done.stdout
-            assert "stands at (180.0, -20.0, 0.0) m" in done.stdout
+            assert "nothing looks wrong" in out
+            assert "stands at (180.0, -20.0, 0.0) m" in out
     assert (folder / "mylog-check.png").is_file()
     assert (folder / "coarse.png").is_file()
     rows = pd.read_parquet(folder / "runs" / "side_by_side" / "results.parquet")
@@ -64,12 +59,11 @@ def test_every_block_of_python_runs(folder):
     code = "\n".join(text for text in blocks("python") if not text.startswith("# make_log"))
     script = folder / "page.py"
     script.write_text(code)
-    done = ran([sys.executable, "-W", "error", script], cwd=folder)
-    assert done.returncode == 0, done.stderr
-    assert "not used" not in done.stdout
-    assert "read: 180 fixes, 2700 ranges" in done.stdout
-    assert "29.54 m\n30.0 m" in done.stdout
-    error = float(re.findall(r"\[\[([\d.]+)\]\]", done.stdout)[0])
+    out = python("-W", "error", script, cwd=folder)
+    assert "not used" not in out
+    assert "read: 180 fixes, 2700 ranges" in out
+    assert "29.54 m\n30.0 m" in out
+    error = float(re.findall(r"\[\[([\d.]+)\]\]", out)[0])
     assert error < 1.0
 
 
@@ -82,5 +76,5 @@ def test_every_kind_is_on_the_page():
 def test_egos_are_a_number_a_list_or_a_name(folder, tmp_path):
     settings = {"data": str(folder / "mylog"), "method": "kalman", "max_neighbours": "0"}
     for egos, wanted in ((2, 2), (["red", "blue"], 2), ("green", 1), ("red,blue", 2), ("auto", 3)):
-        frame = co.run_study("side_by_side", tmp_path, settings={**settings, "egos": egos}, progress=False).frame
+        frame = co.run_study("side_by_side", tmp_path, settings={**settings, "egos": egos}).frame
         assert len(np.unique(frame["ego"])) == wanted

@@ -3,6 +3,7 @@
 import numpy as np
 
 from coopoc.world.links import spherical, to_vector, wrap
+from oracles.messages import slopes
 
 
 def batch_smoother(recording, noise_model, run, x, most=40):  # type: ignore[no-untyped-def]
@@ -68,11 +69,7 @@ def rows(vector, measured, sensors):  # type: ignore[no-untyped-def]
     there, least = np.isfinite(measured), max(sensors.min_range, 0.1 * sensors.range_std) if sensors else 0.0
     measured = np.where(there, measured, np.array(spherical(*vector)))
     at = vector if sensors else to_vector(measured)
-    r = np.linalg.norm(at)
-    d = max(r, least)
-    ground = max(np.hypot(at[0], at[1]), 1e-3 * d)
-    J = np.array([at / r, [-at[1] / ground**2, at[0] / ground**2, 0.0], [0.0, 0.0, -ground / d**2]])
-    J[2, :2] = at[:2] * at[2] / (ground * d**2)
+    J = slopes(at, least)
     if sensors is None:
         J /= np.linalg.norm(J, axis=1)[:, None]
         return J[there], J[there] @ (at - vector)

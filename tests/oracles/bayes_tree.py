@@ -20,9 +20,8 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
     import gtsam
 
     graph, nothing = gtsam.GaussianFactorGraph(), gtsam.VectorValues()
-    for rows, nodes, blocks in _groups(J, dof):
-        model = gtsam.noiseModel.Unit.Create(rows)
-        zero = np.zeros(rows)
+    model, zero = gtsam.noiseModel.Unit.Create(1), np.zeros(1)
+    for nodes, blocks in _groups(J, dof):
         if nodes.shape[1] == 1:
             for i, a in zip(nodes[:, 0].tolist(), blocks[:, 0], strict=True):
                 graph.add(i, a, zero, model)
@@ -42,8 +41,8 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
         raise np.linalg.LinAlgError("gtsam: indeterminate linear system") from singular
 
 
-def _groups(J: Any, dof: int) -> list[tuple[int, Any, Floats]]:
-    """Rows of J as factors: (1, nodes (M, arity), blocks (M, arity, 1, dof)), one row each."""
+def _groups(J: Any, dof: int) -> list[tuple[Any, Floats]]:
+    """Rows of J as factors: (nodes (M, arity), blocks (M, arity, 1, dof)), one row each."""
     matrix = J.tocsr()
     matrix.sort_indices()
     node = matrix.indices // dof
@@ -59,5 +58,5 @@ def _groups(J: Any, dof: int) -> list[tuple[int, Any, Floats]]:
     for count in (1, 2):
         picked = arity[owner] == count
         if picked.any():
-            factors.append((1, nodes[picked].reshape(-1, count), blocks[picked].reshape(-1, count, 1, dof)))
+            factors.append((nodes[picked].reshape(-1, count), blocks[picked].reshape(-1, count, 1, dof)))
     return factors

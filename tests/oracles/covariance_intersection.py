@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
 from coopoc.world.links import spherical, to_vector
-from oracles.messages import Member
+from oracles.messages import Member, directions
 
 LEAST = 1e-9
 """Least weight of one's own estimate: at zero nothing might be left to invert."""
@@ -48,8 +48,7 @@ def pseudo_fix(member: Member, x: Floats, noise_model: NoiseModel, split: bool) 
     geometry."""
     predicted = np.array(spherical(*(member.position - x)))
     there = ~np.isnan(member.relative)
-    (sa, si), (ca, ci) = np.sin(predicted[1:]), np.cos(predicted[1:])
-    H = np.array([[si * ca, si * sa, ci], [-sa, ca, 0.0], [ci * ca, ci * sa, -si]])[there]
+    H = directions(*predicted[1:])[there]
     D, R = H @ np.diag(member.variance) @ H.T, H @ noise_model.relative_cov(predicted) @ H.T
     z = H @ (member.position - to_vector(np.where(there, member.relative, predicted)))
     return (H, z, D, R) if split else (H, z, D + R, 0.0 * R)

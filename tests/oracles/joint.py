@@ -10,7 +10,7 @@ from coopoc import NoiseModel
 from coopoc.arrays import Floats
 from coopoc.kernels.stars.messages import FORGOTTEN
 from coopoc.world.links import spherical, to_vector, wrap
-from oracles.messages import Member, separate
+from oracles.messages import Member, directions, separate, slopes
 
 
 def follow(stars: list[list[Member]], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats, list[Floats]]:
@@ -91,14 +91,7 @@ def converted(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[F
     there = np.isfinite(relative)
     expected = np.array(spherical(*gap))
     measured = np.where(there, relative, expected)
-    _, az, inc = expected
-    rows = np.array(
-        [
-            [np.cos(az) * np.sin(inc), np.sin(az) * np.sin(inc), np.cos(inc)],
-            [-np.sin(az), np.cos(az), 0.0],
-            [np.cos(az) * np.cos(inc), np.sin(az) * np.cos(inc), -np.sin(inc)],
-        ]
-    )
+    rows = directions(*expected[1:])
     cov = rows @ np.atleast_2d(noise_model.relative_cov(expected)) @ rows.T
     return rows[there], np.diag(1 / np.diag(cov)[there]), rows[there] @ (to_vector(measured) - gap)
 
@@ -106,18 +99,8 @@ def converted(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[F
 def whitened(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[Floats, Floats]:
     """Jacobian and residual of what was measured, in standard deviations."""
     assert noise_model.sensors is not None
-    there, (x, y, z) = np.isfinite(relative), gap
-    expected = np.array(spherical(*gap))
-    residual = relative - expected
+    residual = relative - np.array(spherical(*gap))
     residual[1:] = wrap(residual[1:])
-    d = max(expected[0], noise_model.sensors.min_range)
-    ground = max(np.hypot(x, y), 1e-3 * d)
-    jacobian = np.array(
-        [
-            gap / expected[0],
-            [-y / ground**2, x / ground**2, 0.0],
-            [x * z / (ground * d**2), y * z / (ground * d**2), -ground / d**2],
-        ]
-    )
-    std = noise_model.sensors.relative_std
+    there, std = np.isfinite(relative), noise_model.sensors.relative_std
+    jacobian = slopes(gap, noise_model.sensors.min_range)
     return (jacobian / std[:, None])[there], (residual / std)[there]

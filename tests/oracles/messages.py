@@ -1,4 +1,4 @@
-"""The members of a star at a step, one run, as objects: `coopoc.stars` for the oracles."""
+"""Members of a star at a step, one run, as objects: `coopoc.stars` for the oracles; and slopes of what they measure."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,26 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.methods.star import StarStep
+
+
+def directions(azimuth: float, inclination: float) -> Floats:
+    """Unit vectors (rows) along which range, azimuth and inclination grow."""
+    (sa, si), (ca, ci) = np.sin([azimuth, inclination]), np.cos([azimuth, inclination])
+    return np.array([[si * ca, si * sa, ci], [-sa, ca, 0.0], [ci * ca, ci * sa, -si]])
+
+
+def slopes(vector: Floats, least: float) -> Floats:
+    """Jacobian of range, azimuth and inclination, at least `least` m away and not straight above."""
+    (x, y, z), r = vector, np.linalg.norm(vector)
+    d = max(r, least)
+    ground = max(np.hypot(x, y), 1e-3 * d)
+    return np.array(
+        [
+            vector / r,
+            [-y / ground**2, x / ground**2, 0.0],
+            [x * z / (ground * d**2), y * z / (ground * d**2), -ground / d**2],
+        ]
+    )
 
 
 @dataclass

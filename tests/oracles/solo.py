@@ -1,6 +1,7 @@
 """The Kalman filter of one vehicle on one axis, as a loop over time."""
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 
 from coopoc.arrays import Floats
 
@@ -19,3 +20,10 @@ def kalman(z: Floats, u: Floats, q: Floats, r: float, dt: float, x0: float | Non
         estimates.append((x, p))
     mean, variance = np.array(estimates).T
     return mean, variance
+
+
+def filterpys(x: Floats, cov: Floats, dt: float) -> KalmanFilter:
+    """filterpy's filter of a position (3,) that velocities move, at its first fix of covariance `cov`."""
+    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    peer.x, peer.P, peer.R, peer.H, peer.B = x, cov, cov, np.eye(3), dt * np.eye(3)
+    return peer
