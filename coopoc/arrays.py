@@ -16,7 +16,11 @@ Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 AnyArray: TypeAlias = npt.NDArray[Any]
 
-KINDS: dict[Any, tuple[str, str]] = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
+DTYPE_KINDS: dict[Any, tuple[str, str]] = {
+    float: ("fiu", "number"),
+    int: ("iu", "whole number"),
+    bool: ("b", "boolean"),
+}
 """Allowed kinds of dtype -> the name of one entry."""
 TINY = 5e-324
 """The least positive number."""
@@ -46,7 +50,7 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
 def checked(
     field: str, values: npt.ArrayLike, axes: str = "", shape: tuple[int, ...] | None = None, dtype: Any = float
 ) -> AnyArray:
-    """`frozen` values of one of KINDS with that shape.
+    """`frozen` values of one of DTYPE_KINDS with that shape.
 
     Args:
         field: name of the values in an error.
@@ -62,7 +66,7 @@ def checked(
     Traceback (most recent call last):
     coopoc.errors.InputError: t = shape (2,): must have shape (T,) = (3,). Give one entry per index of each axis.
     """
-    kinds, word = KINDS[dtype]
+    kinds, word = DTYPE_KINDS[dtype]
     array = plain(values)
     if array.dtype.kind not in kinds and (array.size or array.dtype == object):
         hint = "Convert it with numpy first: rows must be equally long, text is not parsed, floats are not rounded."
@@ -145,7 +149,7 @@ def number(
     >>> number("range_std", 2)
     2.0
     """
-    kinds, word = KINDS[kind]
+    kinds, word = DTYPE_KINDS[kind]
     scalar = np.asarray(value if isinstance(value, int | float | np.generic | np.ndarray) else None)
     if scalar.ndim or scalar.dtype.kind not in kinds:
         raise InputError(field, shown(value), f"must be a {word}, {allowed}", hint)

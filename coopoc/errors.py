@@ -8,7 +8,7 @@ from importlib import metadata
 from importlib.util import find_spec
 from urllib.parse import unquote, urlsplit
 
-LONGEST = 1500
+LONGEST_PART = 1500
 """Characters of each part of a message."""
 
 
@@ -45,7 +45,7 @@ def _cut(value: object) -> str:
         text = str(value)
     except Exception:
         text = shown(value)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return text if len(text) <= LONGEST_PART else f"{text[:LONGEST_PART]}..."
 
 
 def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:

@@ -178,7 +178,7 @@ def tex(text: str) -> str:
     return "".join(_LATEX.get(letter, letter) for letter in visible(text))
 
 
-FEW, LONG = 4, 60
+FEW_ENTRIES, LONGEST_FIELD = 4, 60
 """Entries up to which a value is shown whole, and the longest text of one field."""
 
 
@@ -203,13 +203,13 @@ def _part(name: str, value: Any) -> str:
         return f"{name} {tuple(shape)}"
     if isinstance(value, Enum):
         return f"{name}={value.name}"
-    if isinstance(value, Mapping) and len(value) > FEW:
-        return f"{name}={{{', '.join(map(repr, list(value)[:FEW]))}, ...}}"
+    if isinstance(value, Mapping) and len(value) > FEW_ENTRIES:
+        return f"{name}={{{', '.join(map(repr, list(value)[:FEW_ENTRIES]))}, ...}}"
     text = _text(value.item() if hasattr(value, "item") else value)
-    if len(text) <= LONG and "\n" not in text:
+    if len(text) <= LONGEST_FIELD and "\n" not in text:
         return f"{name}={text}"
     if isinstance(value, str):
-        return f"{name}={value[:LONG].splitlines()[0]!r}..."
+        return f"{name}={value[:LONGEST_FIELD].splitlines()[0]!r}..."
     kind = type(value[0] if isinstance(value, Sequence) else value).__name__
     return f"{name}={len(value)} x {kind}" if isinstance(value, Sequence) else f"{name}={kind}(...)"
 

@@ -27,7 +27,7 @@ def leave_with(parent: int) -> None:
         threading.Thread(target=watch, daemon=True).start()
 
 
-SELDOM = 60.0
+LINE_SECONDS = 60.0
 """s between two lines of a bar where stderr is no terminal."""
 
 
@@ -52,5 +52,5 @@ def progress_bar(*args: Any, **options: Any) -> Any:
     from tqdm import tqdm
 
     if not sys.stderr.isatty():
-        options |= {"file": _Lines(), "mininterval": SELDOM, "maxinterval": SELDOM, "delay": SELDOM}
+        options |= {"file": _Lines(), "mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS, "delay": LINE_SECONDS}
     return tqdm(*args, **options)

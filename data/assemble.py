@@ -8,9 +8,9 @@ import pandas as pd
 from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
 from coopoc.arrays import Floats, Ints
 
-SAME = 1e-6
+SAME_INSTANT = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
-SLOWEST, FASTEST = 2e-3, 500.0
+MIN_SPEED, MAX_SPEED = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
 REGION = 2.0
 """Degrees that a fleet spans at most; robots that stand in a room, and tremble in motion capture, are metres apart."""
@@ -88,7 +88,7 @@ def assemble(
     else:
         start = stamps.min()
         since = np.round(stamps - start, 6)  # seconds since 1970 would leave few digits to compare
-        steps = (since.max() + SAME) / dt + 1
+        steps = (since.max() + SAME_INSTANT) / dt + 1
         check_size(steps, len(ids), len(stamps), dt, file)
         grid = dt * np.arange(int(steps))
         paths = [(since[rows], numbers[rows]) for rows in by_vehicle]
@@ -148,10 +148,10 @@ def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floa
     right = np.clip(np.searchsorted(t, grid, side="left"), 1, len(t) - 1)
     left = right - 1
     near = np.where(np.abs(grid - t[left]) < np.abs(grid - t[right]), left, right)
-    on_stamp = np.abs(grid - t[near]) <= SAME
+    on_stamp = np.abs(grid - t[near]) <= SAME_INSTANT
     grid = np.where(on_stamp, t[near], grid)
     out = np.column_stack([np.interp(grid, t, v, left=np.nan, right=np.nan) for v in values.T])
-    out[(t[right] - t[left] > max_gap + SAME) & ~on_stamp] = np.nan
+    out[(t[right] - t[left] > max_gap + SAME_INSTANT) & ~on_stamp] = np.nan
     return out
 
 
@@ -176,18 +176,18 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, south), (east, north) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
     near = max(east - west, north - south) < REGION
-    if 0 < speed < SLOWEST and near and max(-west, east) <= 360 and max(-south, north) <= 180:
+    if 0 < speed < MIN_SPEED and near and max(-west, east) <= 360 and max(-south, north) <= 180:
         raise InputError(
             f"{file}: columns x, y",
             f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}",
             "look like degrees, must be metres in a local frame",
             "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.",
         )
-    if speed > FASTEST:
+    if speed > MAX_SPEED:
         raise InputError(
             f"{file}: columns t, x, y, z",
             f"a typical speed of {speed:.4g} m/s",
-            f"must be below {FASTEST:g} m/s",
+            f"must be below {MAX_SPEED:g} m/s",
             "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "
             "vehicles share an id, or pass any_scale=True.",
         )

@@ -16,7 +16,7 @@ import numpy as np
 
 from coopoc.arrays import Bools, Floats, named, number
 from coopoc.errors import InputError, require, said, suggestion, unknown
-from coopoc.formats.values import LARGEST
+from coopoc.formats.values import MAX_NUMBER
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -117,7 +117,7 @@ def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
         texts = cells.map(lambda cell: str(cell)[:300])
         values = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
-    _refuse(cells, ~(np.abs(values) <= LARGEST), file, "must be a finite number")
+    _refuse(cells, ~(np.abs(values) <= MAX_NUMBER), file, "must be a finite number")
     return values
 
 
@@ -159,9 +159,9 @@ def factors(given: Mapping[str, float] | None, names: Collection[str], field: st
     for name, value in named(field, given or {}, f"Give {field}={{name: number}}.").items():
         if name not in names:
             raise unknown(field, name, names)
-        least = 1e-12 if field == "std" or name == "t" else -LARGEST
+        least = 1e-12 if field == "std" or name == "t" else -MAX_NUMBER
         allowed = f"a finite number other than 0{', and > 0' * (least > 0)}"
-        if not number(f"{field} of {name}", value, least, LARGEST, allowed=allowed):
+        if not number(f"{field} of {name}", value, least, MAX_NUMBER, allowed=allowed):
             raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
     return dict(given or {})
 

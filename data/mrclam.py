@@ -10,7 +10,7 @@ import scipy
 
 from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
-from coopoc.formats.values import LARGEST, read_table, read_words
+from coopoc.formats.values import MAX_NUMBER, read_table, read_words
 from coopoc.text import given_path, short_repr
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
@@ -36,9 +36,9 @@ LAGS = np.arange(0.0, 0.525, 0.025)
 WINDOW = 5.0
 """s, over which errors are summed. Of 1, 2, 5, 10, 20 and 30 s it makes the true poses of the first 300 s of set 6 most
 likely (docs/real.md)."""
-LASTING = 60.0
+LASTING_SECONDS = 60.0
 """s, after which scale and bias of odometry are taken as others."""
-FEWEST = 100
+CALIBRATING_COUNT = 100
 """Measurements that a calibration takes."""
 ROBUST = 5.0
 """Robust standard deviations of an innovation beyond which it is an outlier."""
@@ -231,7 +231,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     Source: the variance of batch means, Conway, Some tactical problems in digital simulation, Man. Sci. 10(1), 1963.
     """
     dt = log.fleet.dt
-    first, window, block = slice(1, int(until / dt)), int(WINDOW / dt), int(LASTING / dt)
+    first, window, block = slice(1, int(until / dt)), int(WINDOW / dt), int(LASTING_SECONDS / dt)
     if not 10 * WINDOW <= until < log.fleet.t[-1]:
         raise InputError(
             "calibrate_s",
@@ -259,7 +259,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
         compass=False,
         speed_scale_std=_in_blocks(ahead, driven, block),
         yaw_rate_bias_std=_in_blocks(off, np.ones(rate.shape), block),
-        odometry_error_time=LASTING,
+        odometry_error_time=LASTING_SECONDS,
         min_range=0.0,
     )
     return Calibration(sensors, float(lag), speed, slip, turn)
@@ -321,9 +321,12 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     reach = np.append(log.others[:, 3] - log.true_others[:, 0], marks[:, 3] - np.hypot(dx, dy))
     angle = wrap(np.append(log.others[:, 4] - log.true_others[:, 1], marks[:, 4] - (np.arctan2(dy, dx) - own[:, 2])))
     used = np.isfinite(reach) & (t >= 0) & (t < until)
-    if used.sum() < FEWEST:
+    if used.sum() < CALIBRATING_COUNT:
         raise InputError(
-            "calibrate_s", f"{used.sum()} measurements in {until:g} s", f"must be {FEWEST} or more", "Take longer."
+            "calibrate_s",
+            f"{used.sum()} measurements in {until:g} s",
+            f"must be {CALIBRATING_COUNT} or more",
+            "Take longer.",
         )
     ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, angle))
     return ranges, bearings
@@ -368,7 +371,7 @@ def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
         table = pd.read_csv(file, sep=r"\s+", comment="#", header=None, dtype=float).to_numpy()
     except (ValueError, OverflowError):  # those of pandas for text, empty files and bytes among them
         table = np.empty((0, 0))
-    if table.shape[1:] != (len(form.split()),) or not (np.abs(table) <= LARGEST).all():
+    if table.shape[1:] != (len(form.split()),) or not (np.abs(table) <= MAX_NUMBER).all():
         table = read_table(file, form)[1]  # slow; names the line
     if form.startswith("time"):
         check_time(table[:, 0], file.name)

@@ -14,7 +14,7 @@ from .log.units import Rows, Summary, rows_of
 KNOT, DAY = 1852 / 3600, 86400.0
 LATITUDE, LONGITUDE = re.compile(r"\d\d[0-5]\d(\.\d*)?"), re.compile(r"\d{3}[0-5]\d(\.\d*)?")
 """Degrees and minutes: the parser takes the last digits before the point for minutes, however many there are."""
-SLOW = 0.5
+MIN_COURSE_SPEED = 0.5
 """m/s, below which a course over ground is noise."""
 
 
@@ -97,7 +97,7 @@ class _Sentences:
         elif s.msgID == "RMC":
             speed = float(s.spd or 0.0) * KNOT
             self.rows.append((self.last, "speed", speed, number))
-            if s.cog not in ("", None) and speed > SLOW:
+            if s.cog not in ("", None) and speed > MIN_COURSE_SPEED:
                 self.rows.append((self.last, "compass_deg", float(s.cog), number))
         return ""
 

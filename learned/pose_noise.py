@@ -14,7 +14,7 @@ from coopoc.world.sensors import ANGULAR
 
 LEARNED = "velocity_std_ratio velocity_floor yaw_rate_std range_std azimuth_std speed_scale_std yaw_rate_bias_std"
 """Numbers of Sensors that are learned where they are positive."""
-MOST = {"velocity_std_ratio": 1.0, "speed_scale_std": 1.0, **dict.fromkeys(ANGULAR, np.pi)}
+MAX_STDS = {"velocity_std_ratio": 1.0, "speed_scale_std": 1.0, **dict.fromkeys(ANGULAR, np.pi)}
 """What Sensors allow: above it a measurement means nothing, and the score is flat."""
 STEP = 0.5
 """Of the first simplex, in logarithms."""
@@ -73,7 +73,7 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
 
     def sensors(x: Floats) -> Sensors:
         stds = dict(zip(names, np.exp(x).tolist(), strict=True))
-        return replace(start, **{name: min(std, MOST.get(name, np.inf)) for name, std in stds.items()})
+        return replace(start, **{name: min(std, MAX_STDS.get(name, np.inf)) for name, std in stds.items()})
 
     def loss(x: Floats) -> float:
         assumed = sensors(x)

@@ -28,7 +28,7 @@ SHARED = (
 SCHEDULED = SHARED[3:]
 """Which of them run under every schedule."""
 NEIGHBOURS = (1, 2, 4, 10)
-MOST = NEIGHBOURS[-1]
+MOST_NEIGHBOURS = NEIGHBOURS[-1]
 RATES = (1.0, 2.0, 5.0)
 CAPS = (100.0, 200.0, 400.0, 800.0)
 SCHEDULES = ("nearest", "round robin")
@@ -48,15 +48,15 @@ def over(channel: str, k: int, **limits: Any) -> dict[str, Any]:
 
 def under(cap: float, schedule: str, method: str, noise_model: str) -> dict[str, Any]:
     """The selection of a method under a cap and a schedule."""
-    return of(method, noise_model, **over("ideal", MOST, cap_bytes_per_second=cap, schedule=schedule))
+    return of(method, noise_model, **over("ideal", MOST_NEIGHBOURS, cap_bytes_per_second=cap, schedule=schedule))
 
 
 def _grid() -> list[Where]:
     """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; some
     of them under caps with the other schedule."""
     channels = [over(name, k) for name in CHANNELS for k in NEIGHBOURS]
-    rates = [over("ideal", MOST, rate_hz=rate) for rate in RATES]
-    caps = [over("ideal", MOST, cap_bytes_per_second=cap) for cap in CAPS]
+    rates = [over("ideal", MOST_NEIGHBOURS, rate_hz=rate) for rate in RATES]
+    caps = [over("ideal", MOST_NEIGHBOURS, cap_bytes_per_second=cap) for cap in CAPS]
     return [
         *(of(*pair, **over("ideal", 0)) for pair in (*SOLO, PAST)),
         *(of(*pair, **each) for each in (*channels, *rates, *caps) for pair in SHARED),
@@ -106,7 +106,9 @@ def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
 
 
 METHODS = [
-    ((WORDS[name], look(pair[0]).label, pair[1]), of(*pair, **over(name, MOST))) for name in CHANNELS for pair in SHARED
+    ((WORDS[name], look(pair[0]).label, pair[1]), of(*pair, **over(name, MOST_NEIGHBOURS)))
+    for name in CHANNELS
+    for pair in SHARED
 ]
 """Each method over each channel: labels and selection."""
 BY_SCHEDULE = {name: {"schedule": name} for name in SCHEDULES}
@@ -121,8 +123,8 @@ STUDY = lineup.study(
             ("Channel", "Method", "Noise model"),
             METHODS,
             {"RT-LE [m]": mean, "Payload [B/s]": _rate, "On air [B/s]": partial(_rate, value="bytes_per_second")},
-            f"K = {MOST} over field channels (CAM, BSM, CPM): rate, latency, bursts of loss, and what a message "
-            "carries anyway. Payload is what a method adds.",
+            f"K = {MOST_NEIGHBOURS} over field channels (CAM, BSM, CPM): rate, latency, bursts of loss, and what a "
+            "message carries anyway. Payload is what a method adds.",
             decimals=3,
         ),
         "schedules": selections(
@@ -135,7 +137,7 @@ STUDY = lineup.study(
                 )[SCHEDULES[1]],
             },
             "RT-LE [m] when an ego receives no more than the cap, by schedule; differences are paired, with 95 % "
-            f"intervals. K = {MOST} at 10 Hz.",
+            f"intervals. K = {MOST_NEIGHBOURS} at 10 Hz.",
             best="min",
             unranked=("Difference",),
             decimals=3,

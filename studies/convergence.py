@@ -19,7 +19,7 @@ from .views import Plot, curves, table
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
 BOTH = {"method": [FEDERATED, CENTRALISED]}
-NEAR = 0.03
+REACHED_SHARE = 0.03
 """Share of the centralised net's RT-LE within which the federated net has reached it."""
 
 
@@ -114,7 +114,7 @@ def _findings(results: Results) -> dict[str, str]:
     if fed and centralised:
         end = centralised[-1]
         reached = settled([value / end for value in fed])
-        within = f"within {100 * NEAR:g} % of it"
+        within = f"within {100 * REACHED_SHARE:g} % of it"
         when = f"not {within}" if reached is None else f"{within} from round {reached} on"
         texts["centralised"] = (
             f"After {len(fed) - 1} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
@@ -124,12 +124,12 @@ def _findings(results: Results) -> dict[str, str]:
 
 
 def settled(ratios: Sequence[float]) -> int | None:
-    """First round from which on all ratios are within NEAR of 1; None if the last is not.
+    """First round from which on all ratios are within REACHED_SHARE of 1; None if the last is not.
 
     >>> settled([1.5, 1.01, 0.9, 1.02, 1.0])
     3
     """
-    outside = [number for number, ratio in enumerate(ratios) if not abs(ratio - 1) <= NEAR]
+    outside = [number for number, ratio in enumerate(ratios) if not abs(ratio - 1) <= REACHED_SHARE]
     first = outside[-1] + 1 if outside else 0
     return first if first < len(ratios) else None
 

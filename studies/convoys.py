@@ -13,14 +13,14 @@ from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 
 from .pose_drives import hashed
-from .roads import BLOCK, ROADS, seen
+from .roads import BLOCK_SECONDS, ROADS, seen
 from .tasks import blocks_of, located, planar, received, rounded
 
 CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
 """Task -> road whose drive is cut."""
-PIECES, SHORTEST, SPREAD, RUNS, SEED = 4, 25.0, 25.0, 4, 2026
+PIECES, SHORTEST_PIECE, START_SPREAD, RUNS, SEED = 4, 25.0, 25.0, 4, 2026
 """Vehicles at most; s of a piece at least; m within which they start; draws of ranges and angles, and their seed."""
-SLOW = 1.0
+MIN_COURSE_SPEED = 1.0
 """m/s, below which a course is noise: the odometry errs as it did before."""
 
 
@@ -47,10 +47,10 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     now = np.arange(len(there))
     path = np.interp(now, now[there], truth.position[there, column] @ [1, 1j, 0])
     motion = np.diff(path, prepend=path[0])
-    ratio = _ratio(recording.velocity[0, :, column] @ np.array([1, 1j, 0]) * dt, motion, SLOW * dt)
+    ratio = _ratio(recording.velocity[0, :, column] @ np.array([1, 1j, 0]) * dt, motion, MIN_COURSE_SPEED * dt)
     error = recording.gnss[0, :, column] @ np.array([1, 1j, 0]) - path
     route, rows = slice(starts[0], starts[0] + length), np.array(starts) + np.arange(length)[:, None]
-    offset = SPREAD * np.random.default_rng(SEED).uniform(-1, 1, (len(starts), 2)) @ [1, 1j] / np.sqrt(2)
+    offset = START_SPREAD * np.random.default_rng(SEED).uniform(-1, 1, (len(starts), 2)) @ [1, 1j] / np.sqrt(2)
     true = (path[route] - path[starts[0]])[:, None] + offset
     driven = np.repeat(motion[route, None], len(starts), axis=1)
     ids, t = tuple(f"v{k}" for k in range(len(starts))), recording.t[:length] - recording.t[0]
@@ -64,9 +64,9 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
 
 
 def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
-    """First steps of pieces, each with a fix, and their length in steps: as many as PIECES of SHORTEST s at least."""
+    """First steps of pieces, each with a fix, and their length in steps: PIECES of SHORTEST_PIECE s, or fewer."""
     fixes = np.flatnonzero(np.isfinite(recording.gnss[0, :, column, 0]))
-    count = int(np.clip((len(recording.t) - fixes[0]) * recording.dt / SHORTEST, 1, PIECES))
+    count = int(np.clip((len(recording.t) - fixes[0]) * recording.dt / SHORTEST_PIECE, 1, PIECES))
     wanted = np.linspace(fixes[0], len(recording.t), count + 1)[:-1]
     starts = [int(fixes[np.searchsorted(fixes, np.ceil(first))]) for first in wanted]
     ends = [*starts[1:], len(recording.t)]
@@ -100,7 +100,7 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     method(recording.between(0, 3), egos)  # compiles
     track = method(recording, egos)
     gap, nees = planar(track, fleet)
-    size = min(BLOCK, len(recording.t) * recording.dt / 4) / recording.dt
+    size = min(BLOCK_SECONDS, len(recording.t) * recording.dt / 4) / recording.dt
     blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
     row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}

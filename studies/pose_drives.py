@@ -22,7 +22,7 @@ from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.study.study import Params
 from coopoc.world.storage import digest
 
-LONGEST, SHARE = 300.0, 0.4
+LONGEST_CALIBRATION, CALIBRATION_SHARE = 300.0, 0.4
 """s, and share of the drive, that calibrate where the settings leave it open."""
 BLOCK, BLOCKS = 30.0, 4
 """s of a block of time, and the least number of blocks, where the settings leave it open."""
@@ -70,7 +70,9 @@ def calibrated(p: Params) -> float:
         InputError: nothing is left to be scored.
     """
     seconds = length(p["data"])
-    until = min(LONGEST, SHARE * seconds) if p["calibrate_s"] is None else float(p["calibrate_s"])
+    until = (
+        min(LONGEST_CALIBRATION, CALIBRATION_SHARE * seconds) if p["calibrate_s"] is None else float(p["calibrate_s"])
+    )
     if not 0 <= until < seconds:
         allowed = f"must be 0 or more and end before the drive, {seconds:g} s"
         raise InputError("calibrate_s", f"{until:g} s", allowed, "Leave a part to score.")

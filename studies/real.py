@@ -177,7 +177,7 @@ def _distinct(number: int, axis: tuple[int, ...], most: int) -> bool:
     return number <= most or (number in axis and all(other < most for other in axis if other < number))
 
 
-FEW = 4
+COMPARED_LANDMARKS = 4
 """Landmarks whose number a finding compares with, at most."""
 UNFIT = 100.0
 """Mean NEES of a pose that no drift explains: units, axes or noise are other ones."""
@@ -264,7 +264,10 @@ def _trade(results: Results) -> "Plot | None":
         return interval(results, at) if kind == where["kind"] else None
 
     places = {max(_sent(results, where) or 0.0, 1.0 + 0.3 * i): {"at": i} for i, where in enumerate(each)}
-    marks, ticks = [n for n in _run(results, "landmarks") if n <= FEW], {1.0: "0", 1e2: "100", 1e4: "10 k", 1e6: "1 M"}
+    marks, ticks = (
+        [n for n in _run(results, "landmarks") if n <= COMPARED_LANDMARKS],
+        {1.0: "0", 1e2: "100", 1e4: "10 k", 1e6: "1 M"},
+    )
     panels = [Panel(places, {"landmarks": n}, _landmarks(n), "Sent [B]", ticks) for n in marks]
     looks = ("Cooperating", "#0072B2", "s"), ("Training", "#D55E00", "o"), ("Both", "#009E73", "D")
     lines = [

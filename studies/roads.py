@@ -18,7 +18,7 @@ from coopoc.world.recording import MEASURED
 from .pose_drives import hashed
 from .tasks import blocks_of, located, planar, rounded
 
-SHARE, BLOCK = 0.4, 30.0
+CALIBRATION_SHARE, BLOCK_SECONDS = 0.4, 30.0
 """Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""
 EVERY, OUTAGE, PERIOD = 10, 30.0, 180.0
 """One fix in so many is kept, and none in the last s of every period of s."""
@@ -105,7 +105,7 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
         made: a method, which is calibrated if it has a method `fitted`.
     """
     recording, truth = seen(task, data)
-    start, column = int(SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
+    start, column = int(CALIBRATION_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
     files = [located(data, name) for name in roads(data)[task]]
@@ -126,7 +126,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
     """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
     vehicle, NEES of (x, y), us of a step."""
     blocks, ratios, seconds, axis = list[float](), list[Floats](), 0.0, dict[str, float]()
-    size = min(BLOCK / recording.dt, (len(recording.t) - start) / 4)
+    size = min(BLOCK_SECONDS / recording.dt, (len(recording.t) - start) / 4)
     for column in recording.observers:
         squares = np.full(len(recording.t), np.nan)
         for begin, stop in recording.stretches(column):

@@ -79,10 +79,10 @@ IDEAL = V2X(max_neighbours=6)
 CAM = replace(V2X.cam(6), latency=0.1, loss=0.3)
 HEADING = replace(WHITE, heading_std=float(np.deg2rad(2)), heading_bias_std=float(np.deg2rad(3)))
 LASTING = replace(WHITE, gnss_std=(1.5, 1.5, 1.5), gnss_drift_std=2.5, gnss_common_std=1.5)
-LONG = Outliers(ranges=Fault(0.05, (3.0, 20.0)))
-MISTAKEN = replace(WHITE, outliers=replace(LONG, angles=Fault(0.01)))
+LONG_RANGES = Outliers(ranges=Fault(0.05, (3.0, 20.0)))
+MISTAKEN = replace(WHITE, outliers=replace(LONG_RANGES, angles=Fault(0.01)))
 CANYON = replace(WHITE, outliers=Outliers.urban_canyon())
-STORM = replace(HEADING, outliers=LONG)
+STORM = replace(HEADING, outliers=LONG_RANGES)
 FIFTH, LATER = Spoofing(0.2), Spoofing(0.2, start=30.0)
 TASKS = (
     Task("alone", "town10", Sensors.paper_scenario1(), V2X(0)),
@@ -118,7 +118,7 @@ def recording(task: Task, everyone: bool, remove_outliers: bool = False) -> tupl
     return observed, fleet
 
 
-FEW = 3
+BOUND_RUNS = 3
 """Runs over which the bound of many vehicles is averaged where it depends on them: each takes half a minute."""
 
 
@@ -134,7 +134,7 @@ def bound(task: Task, information: str) -> float:
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
     clean: Recording | None = None
     if sensors.outliers or task.attack.share:
-        runs = FEW if information in ("past", "fleet") else task.runs
+        runs = BOUND_RUNS if information in ("past", "fleet") else task.runs
         clean, _ = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)
     if information == "fleet":
         bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, list(task.columns)], 1, 0)]

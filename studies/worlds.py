@@ -17,7 +17,7 @@ from .world_faults import EGOS, KINDS, OF_MOTION, OF_NEIGHBOURS, RUNS, WEIGHTS, 
 
 Split = Literal["test", "validation", "development"]
 SPLITS: tuple[Split, ...] = ("test", "validation", "development")
-STEPS = (0.05, 0.1, 0.1, 0.2, 0.5, 1.0)
+STEP_SECONDS = (0.05, 0.1, 0.1, 0.2, 0.5, 1.0)
 """s between two steps, each as probable as it stands here."""
 COUNTS = (0.2, 0.3, 0.3, 0.2)
 """Probability of zero to three kinds of fault."""
@@ -107,7 +107,7 @@ def _kinds(rng: Draws, scene: Scene) -> list[str]:
 def _nominal(key: int, split: Split) -> Scene:
     """Fleet, egos, levels that are assumed and act, and an ideal channel."""
     rng = _rng(key, "scene")
-    dt, seconds = float(rng.choice(STEPS)), rng.uniform(40.0, 60.0)
+    dt, seconds = float(rng.choice(STEP_SECONDS)), rng.uniform(40.0, 60.0)
     t = dt * np.arange(round(seconds / dt) + 1)
     name = str(rng.choice([*DRIVES]))
     before = DRIVES[name](rng, np.append(-dt, t), split)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 JOINT, ALONE = "joint", "kalman"
 """What a method is compared with on the same draws: the textbook filter, and being alone."""
-WORSE = 1.1
+WORSE_RATIO = 1.1
 """Ratio of errors from which on a method is worse."""
 BAND = special.chdtri(3, [0.975, 0.025])
 """In which 95 % of the NEES of a consistent filter are, of three degrees of freedom."""
@@ -190,9 +190,9 @@ def summary(found: "pd.DataFrame") -> dict[str, Any]:
     Args:
         found: worlds and their ratios.
     """
-    sound, worse = found[np.isfinite(found["over_better"])], found["over_better"] > WORSE
+    sound, worse = found[np.isfinite(found["over_better"])], found["over_better"] > WORSE_RATIO
     made: dict[str, Any] = {"worlds": len(found), "failed": len(found) - len(sound)}
-    made["worse_than_alone"] = _interval(100.0 * (found["over_alone"] > WORSE))
+    made["worse_than_alone"] = _interval(100.0 * (found["over_alone"] > WORSE_RATIO))
     made["worse_than_better"] = _interval(100.0 * worse)
     made["worse_unnoted"] = _interval(100.0 * (worse & (found["noted"] == 0.0)))
     if len(sound):

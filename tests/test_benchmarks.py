@@ -15,7 +15,7 @@ from conftest import measured, refused
 from shell import ROOT
 
 import coopoc as co
-from coopoc.data.log.residuals import SURE
+from coopoc.data.log.residuals import TRUE_POSE_STD
 from coopoc.data.registry import load_log
 from coopoc.studies import benchmark, tasks
 from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
@@ -245,7 +245,7 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
         first = range(0, len(error) - size + 1, size)
         return float(np.mean([np.sqrt(np.mean(error[k : k + size] ** 2, axis=0)) for k in first]))
 
-    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=SURE, assumed=noise)
+    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=TRUE_POSE_STD, assumed=noise)
     assert whole["rt_le_m"][0] == pytest.approx(by_hand(fleet), abs=2e-4)
     own = rows[f"{tmp_path / 'mine.py'}:Own"]
     mine = co.PoseFilter("solo", begin=begin, assumed=noise)

@@ -23,7 +23,7 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task):
     assert count * length <= len(drive.t)
     assert np.isfinite(recording.gnss[:, 0]).all()
     start = np.linalg.norm(fleet.position[0] - fleet.position[0].mean(axis=0), axis=-1)
-    assert start.max() < 2 * convoys.SPREAD
+    assert start.max() < 2 * convoys.START_SPREAD
     error = (recording.gnss[0] - fleet.position)[..., :2]
     real = (drive.gnss[0, :, column] - truth.position[:, column])[:, :2]
     begins = convoys._pieces(drive, column)[0]

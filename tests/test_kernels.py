@@ -81,7 +81,7 @@ def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch):
 def test_a_bar_fills_no_log_with_carriage_returns(capsys):
     for seldom, last in ((60.0, ""), (0.0, "steps: 100%")):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(workers, "SELDOM", seldom)
+            patch.setattr(workers, "LINE_SECONDS", seldom)
             assert [*workers.progress_bar(range(2), desc="steps")] == [0, 1]
         said = capsys.readouterr().err
         assert not {"\r", "\x1b"} & {*said}

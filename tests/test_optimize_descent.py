@@ -62,7 +62,7 @@ def test_a_bar_shows_steps_and_cost(backend, monkeypatch, capsys):
     quick = co.solve(ranged(), backend)
     assert "solve" not in capsys.readouterr().err
     monkeypatch.setattr(levenberg_marquardt, "DELAY", -1.0)
-    monkeypatch.setattr(workers, "SELDOM", 0.0)  # no terminal: a line at every step
+    monkeypatch.setattr(workers, "LINE_SECONDS", 0.0)  # no terminal: a line at every step
     shown = co.solve(ranged(), backend)
     assert "cost" in capsys.readouterr().err
     assert np.array_equal(shown.position, quick.position)

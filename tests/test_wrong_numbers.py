@@ -339,7 +339,7 @@ def test_a_file_is_refused_by_its_headers(tmp_path, content, monkeypatch):
     (tmp_path / "bad.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-9])
     with refused(r"bad.npz = .*must be a recording in \.npz"):
         co.read_log(tmp_path / "bad.npz")
-    monkeypatch.setattr("coopoc.world.storage.LARGEST", 9)
+    monkeypatch.setattr("coopoc.world.storage.MAX_BYTES", 9)
     with refused("more than 2 GB"):
         read_recording(tmp_path / "good.npz")
 

@@ -28,7 +28,7 @@ UNKNOWN_HEADING = 3.0 / np.pi**2
 
 NO_ERROR = 1e-18
 """m^2, variance of an error of the fixes that there is not."""
-LEAST = 1e-6
+MIN_GROUND_DISTANCE = 1e-6
 """m, of the distance in the plane: straight above one another, two vehicles have no azimuth."""
 
 
@@ -394,7 +394,7 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     r"""Information (E, 3, 3) 1/m^2 of relative vectors, $\sum_k \nabla h_k \nabla h_k^\top / \sigma_k^2$ over what is
     measured of range, azimuth and inclination."""
     away, azimuth, inclination = spherical(*edges.vector.T)
-    flat = np.maximum(np.hypot(*edges.vector[:, :2].T), LEAST)
+    flat = np.maximum(np.hypot(*edges.vector[:, :2].T), MIN_GROUND_DISTANCE)
     sa, ca, si, ci, none = np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination), 0.0 * away
     rows = [[si * ca, si * sa, ci], [-sa / flat, ca / flat, none], [ci * ca / away, ci * sa / away, -si / away]]
     gradients = np.stack([np.stack(row, axis=-1) for row in rows], axis=1)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
 from ..text import short_repr
-from .values import LEAST, UNIT, to_rotation
+from .values import MIN_DIAGONAL, UNIT, to_rotation
 
 ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be
     "pose_prior": ("pose",),
@@ -303,7 +303,8 @@ def _ends(graph: Graph, field: str, nodes: Ints, location: Location) -> None:
 def _values(edges: Edges, field: str, location: Location) -> None:
     """InputError for numbers that no edge may have; what is exact or of the least size may stay.
 
-    >>> _values(PointEdges([[0], [0]], np.zeros((2, 2)), [np.zeros((2, 2)), LEAST * np.eye(2)]), "point_prior", str)
+    >>> exact = [np.zeros((2, 2)), MIN_DIAGONAL * np.eye(2)]
+    >>> _values(PointEdges([[0], [0]], np.zeros((2, 2)), exact), "point_prior", str)
     """
     for name in [n for n in shapes(field, 2, 0) if n not in ("nodes", "stamps")]:
         values: Floats = getattr(edges, name).reshape(len(edges), -1)
@@ -315,8 +316,8 @@ def _values(edges: Edges, field: str, location: Location) -> None:
             )
         if name in ("variance", "covariance"):
             size = values[:, :: math.isqrt(values.shape[1]) + 1]  # the diagonal
-            extreme = (((size > 0) & (size < LEAST)) | (size > 1 / LEAST)).any(axis=1)
-            allowed = f"must be 0, or of a size in {LEAST:g}..{1 / LEAST:g}: its inverse overflows"
+            extreme = (((size > 0) & (size < MIN_DIAGONAL)) | (size > 1 / MIN_DIAGONAL)).any(axis=1)
+            allowed = f"must be 0, or of a size in {MIN_DIAGONAL:g}..{1 / MIN_DIAGONAL:g}: its inverse overflows"
             _refuse(location, field, extreme, values, allowed, mend, actual)
         if name == "orientation":
             _unit(getattr(edges, name), field, location)

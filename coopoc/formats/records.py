@@ -12,7 +12,7 @@ from .graph import ENDS, Edges, Graph, edges_of
 from .values import inverse, malformed, symmetric, to_numbers
 
 VALUES = {"pose2": "x y theta", "pose3": "x y z qx qy qz qw", "point2": "x y", "point3": "x y z"}
-KINDS = ("pose", "point", *ENDS)[:-1]
+TAG_KINDS = ("pose", "point", *ENDS)[:-1]
 """Of vertices and edges, in the order of a format's tags; ranges have one tag for the plane and for space."""
 Index = dict[str, dict[str, int]]  # pose or point -> the word for a vertex -> its place
 
@@ -69,9 +69,9 @@ class Record:
 
 
 def by_tag(tags: Mapping[int, str], stamped: Collection[str] = (), offset: Collection[str] = ()) -> dict[str, Record]:
-    """Records of the tags of a format, dimension -> those of KINDS in one text, and of EDGE_RANGE: kinds with a stamp,
-    tags with an offset."""
-    made = {tag: (kind, d) for d, row in tags.items() for kind, tag in zip(KINDS, row.split(), strict=True)}
+    """Records of the tags of a format, dimension -> those of TAG_KINDS in one text, and of EDGE_RANGE: kinds with a
+    stamp, tags with an offset."""
+    made = {tag: (kind, d) for d, row in tags.items() for kind, tag in zip(TAG_KINDS, row.split(), strict=True)}
     made["EDGE_RANGE"] = "ranges", 0
     return {tag: Record(kind, d, kind in stamped, tag in offset) for tag, (kind, d) in made.items()}
 

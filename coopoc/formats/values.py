@@ -8,9 +8,9 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..errors import InputError
 
-LARGEST = 1e100
+MAX_NUMBER = 1e100
 """Numbers beyond it are none that was measured, and their squares overflow."""
-LEAST = 1e-100
+MIN_DIAGONAL = 1e-100
 """Least entry of a diagonal, and one over the largest: products of what is beyond them leave the range of numbers."""
 UNIT = 1e-2
 """|norm - 1| of a quaternion that was merely rounded (to three decimals); more is not a rotation."""
@@ -56,7 +56,7 @@ def to_numbers(file: str, lines: Sequence[int], words: Sequence[Sequence[str]], 
             values[row] = [_number(word) for word in line] if len(line) == columns else np.nan
         except ValueError:
             values[row] = np.nan
-    bad = np.flatnonzero(~(np.abs(values) <= LARGEST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(values) <= MAX_NUMBER).all(axis=1))
     if len(bad):
         raise malformed(file, lines[bad[0]], words[bad[0]], form)
     return values
@@ -164,7 +164,7 @@ def inverse(matrices: Floats, location: Callable[[int], str], repairs: list[str]
     [[[0.25, 0.0], [0.0, 1e-08]]]
     """
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
-    positive = (diagonal > LEAST) & (diagonal < 1 / LEAST)
+    positive = (diagonal > MIN_DIAGONAL) & (diagonal < 1 / MIN_DIAGONAL)
     scale = np.exp2(np.rint(-0.5 * np.log2(np.where(positive, diagonal, 1))))
     both = scale[:, :, None] * scale[:, None, :]
     scaled = matrices * both

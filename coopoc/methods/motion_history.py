@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ..arrays import Floats, number, plain
 from ..errors import InputError
 from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
-from ..world.plausible import FARTHEST
+from ..world.plausible import MAX_POSITION
 
 
 class MotionHistory:
@@ -53,7 +53,7 @@ class MotionHistory:
             "dt",
             dt,
             sys.float_info.min,
-            FARTHEST,
+            MAX_POSITION,
             allowed="finite and > 0",
             hint="Give the seconds since the last step.",
         )
@@ -73,7 +73,7 @@ class MotionHistory:
             if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
                 self.check(gnss, velocity, dt, fix_age)
             row[:3], row[3:6], row[6], row[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-            if any(abs(number) > FARTHEST for number in row.tolist()):
+            if any(abs(number) > MAX_POSITION for number in row.tolist()):
                 self.check(gnss, velocity, dt, fix_age)
         except Exception:  # a class from elsewhere may raise anything
             self.check(gnss, velocity, dt, fix_age)
@@ -84,7 +84,7 @@ PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
 """What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
 
 
-def three(field: str, value: npt.ArrayLike, limit: float = FARTHEST) -> Floats:
+def three(field: str, value: npt.ArrayLike, limit: float = MAX_POSITION) -> Floats:
     """(3,) numbers within the limit; InputError naming the field if they are not.
 
     >>> three("velocity", [1, 2])

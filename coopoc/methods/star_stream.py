@@ -32,7 +32,7 @@ from ..kernels.stars.cooperative_state import (
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_step
 from ..world.links import drop_steep_azimuths
-from ..world.plausible import FARTHEST, radians
+from ..world.plausible import MAX_POSITION, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
 from .motion_history import MotionHistory, fix_or_none, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
@@ -71,7 +71,7 @@ class RelativeMeasurement:
     def __post_init__(self) -> None:
         row = np.full(WIDTH, np.nan)
         relative, named = numbers(self.relative), isinstance(self.id, str) and self.id
-        if relative.shape != (3,) or not named or not (0.0 < relative[0] < FARTHEST or math.isnan(relative[0])):
+        if relative.shape != (3,) or not named or not (0.0 < relative[0] < MAX_POSITION or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
         radians("relative angles", relative[1:])
@@ -81,7 +81,7 @@ class RelativeMeasurement:
         )
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
-            row[SOLO_VARIANCE:ODOMETER] = variance = three("neighbour's variance", self.variance, FARTHEST**2)
+            row[SOLO_VARIANCE:ODOMETER] = variance = three("neighbour's variance", self.variance, MAX_POSITION**2)
             refuse("neighbour's variance", variance, variance <= 0, "must be > 0 m^2", "Send stream.broadcast.")
         if self.odometer is not None:
             row[ODOMETER:SPEED] = three("neighbour's odometer", self.odometer)

@@ -26,7 +26,7 @@ from .tables import Entry, Table
 Direction: TypeAlias = str | float
 """Of a metric: "lower" or "higher" is better, or the value that is best."""
 
-TOLERANCE, TRAINED = 0.01, 0.05
+PAIRED_TOLERANCE, TRAINED_TOLERANCE = 0.01, 0.05
 """Share of a number by which it may move: draws are paired, but libraries differ in their last digits, and nets are
 trained by them."""
 SIGMA = 2.0
@@ -40,7 +40,7 @@ def _finite(value: Any) -> float:
     return float(value)
 
 
-KINDS: Mapping[str, Any] = {
+NUMBER_READERS: Mapping[str, Any] = {
     "where": dict,
     "metric": str,
     "value": _finite,
@@ -133,7 +133,10 @@ class Reference:
         fields = {"study": str, "settings": dict, "numbers": list}
         document = store.content(path, fields, "holds no reference numbers", hint)
         try:
-            numbers = tuple(Number(**{name: KINDS[name](each[name]) for name in KINDS}) for each in document["numbers"])
+            numbers = tuple(
+                Number(**{name: NUMBER_READERS[name](each[name]) for name in NUMBER_READERS})
+                for each in document["numbers"]
+            )
         except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise InputError("file", str(path), f"is damaged ({error})", hint) from None
         return cls(document["study"], document["settings"], numbers)
@@ -149,7 +152,7 @@ def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
     numbers = []
     for point, rows in results.groups(results.axes) if len(results.frame) else ():
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
-        tolerance = TRAINED if SEED in rows and rows[SEED].notna().any() else TOLERANCE
+        tolerance = TRAINED_TOLERANCE if SEED in rows and rows[SEED].notna().any() else PAIRED_TOLERANCE
         for metric, better in metrics.items():
             each = ego_by_run(rows, metric)[0] if metric in rows else np.empty(0)
             if each.size:

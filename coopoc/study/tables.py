@@ -279,7 +279,7 @@ def lost(results: Results, where: Where | None = None) -> list[str]:
     return [text.format(label("method", name), count) for name, count in runs.items() if count]
 
 
-ALIKE, WORSE = 1e-3, 1.1
+EQUAL_ERRORS, WORSE_RATIO = 1e-3, 1.1
 """m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
 
 
@@ -298,11 +298,11 @@ def unused(results: Results, real: bool) -> list[str]:
         together, alone = (both[f"{value}_{side}"] for side in "xy")
         gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
         text = f"{label('method', method)}, K = {k}:"
-        if k and len(gap) == len(part) and gap.max() < ALIKE:
+        if k and len(gap) == len(part) and gap.max() < EQUAL_ERRORS:
             lacks = "what was measured lacks what it takes, such as an azimuth"
             why = lacks if part["bytes_per_second"].any() else "no message arrived"
-            text += f" equal to solo within {ALIKE:g} m: no neighbour's measurement was used, because {why}."
-        elif k and real and together.mean() > WORSE * alone.mean():
+            text += f" equal to solo within {EQUAL_ERRORS:g} m: no neighbour's measurement was used, because {why}."
+        elif k and real and together.mean() > WORSE_RATIO * alone.mean():
             text += f" worse than alone, {together.mean():.3g} m for {alone.mean():.3g} m: what was measured of "
             text += "neighbours, or its stated noise, is wrong. coopoc data check says what looks so."
         else:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..arrays import Bools, Floats, check_arrays, check_fields, checked, listed, number
 from ..errors import InputError, shown, unknown
 from .long_table import long_table
-from .plausible import FARTHEST, FASTEST, headings, plausible
+from .plausible import MAX_POSITION, MAX_SPEED, headings, plausible
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,8 +61,8 @@ class Fleet:
         if self.heading is not None:
             headings(self.heading, self.velocity)
         _check_gaps(self)
-        plausible("position", self.position, FARTHEST)
-        plausible("velocity", self.velocity, FASTEST)
+        plausible("position", self.position, MAX_POSITION)
+        plausible("velocity", self.velocity, MAX_SPEED)
 
     @property
     def dt(self) -> float:

@@ -5,7 +5,7 @@ import numpy as np
 from ..arrays import TWO_TURNS, Floats, refuse
 from .links import wrap
 
-FARTHEST, FASTEST, FASTEST_TURN = 1e8, 1e4, 100.0
+MAX_POSITION, MAX_SPEED, MAX_YAW_RATE = 1e8, 1e4, 100.0
 """m, m/s and rad/s (16 turns; odometry of mrclam6.pyfg has 10): what lies beyond was not measured on Earth, and its
 square leaves no digits to what stands beside it."""
 UNWRAPPED = 1e6
@@ -17,7 +17,7 @@ COARSE = 0.01
 def plausible(field: str, values: Floats, limit: float, hint: str = "Is it in another unit?") -> None:
     """InputError for the first number beyond the limit, and for positions that float32 has rounded; NaN is missing.
 
-    >>> plausible("velocity", np.array([3.0, -1e9]), FASTEST)
+    >>> plausible("velocity", np.array([3.0, -1e9]), MAX_SPEED)
     Traceback (most recent call last):
     coopoc.errors.InputError: velocity[1] = -1000000000.0: must be within +-10000 in SI units. Is it in another unit?
     """
@@ -26,7 +26,7 @@ def plausible(field: str, values: Floats, limit: float, hint: str = "Is it in an
     largest = max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None))
     if largest > limit:
         refuse(field, values, np.abs(values) > limit, f"must be within +-{limit:g} in SI units", hint)
-    if (step := float(np.spacing(np.float32(largest)))) > COARSE and limit == FARTHEST:
+    if (step := float(np.spacing(np.float32(largest)))) > COARSE and limit == MAX_POSITION:
         there = values[np.isfinite(values)]
         rounded = np.full(values.shape, bool((there == there.astype(np.float32)).all() and (there % 1).any()))
         allowed = f"must have more digits than those of float32, which are {step:g} m apart there"

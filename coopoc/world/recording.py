@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..text import short_repr
 from .fleet import clock, columns, interval, names
 from .links import Links, drop_steep_azimuths, stretches
-from .plausible import FARTHEST, FASTEST, FASTEST_TURN, headings, plausible, radians
+from .plausible import MAX_POSITION, MAX_SPEED, MAX_YAW_RATE, headings, plausible, radians
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -45,7 +45,7 @@ class Body:
         for name in ("yaw_rate", "heading"):
             self.__dict__[name] = checked(name, getattr(self, name), "(R, T, N)", shape)
             shape = self.yaw_rate.shape
-        radians("yaw_rate", self.yaw_rate, FASTEST_TURN)
+        radians("yaw_rate", self.yaw_rate, MAX_YAW_RATE)
         headings(self.heading)
 
     def check(self, velocity: Floats) -> None:
@@ -55,12 +55,12 @@ class Body:
         refuse("yaw_rate", rate, np.isnan(rate) != np.isnan(velocity[..., 0]), allowed, "A vehicle that stands has 0.")
 
 
-WIDE = 0.5
+DEGREES_STD = 0.5
 """rad, of a standard deviation that is rather one in degrees."""
 UNLIKELY = "unlikely: "
 UNITS = "velocities are in m/s, headings and yaw rates in radians and anticlockwise, headings from east"
 """First word of a note on what a recording holds, and what may be wrong with odometry."""
-LAG, LONG, APART, SHARE = 10.0, 6.0, 0.4, 0.3
+COMPARED_SECONDS, LONG_STDS, APART_SHARE, CONTRADICTING_SHARE = 10.0, 6.0, 0.4, 0.3
 """s between the fixes whose distance is compared with the odometry's; standard deviations of a fix, stated and as they
 scatter, that the longer of the two must have (the shorter one: one); share of both lengths by which they contradict
 each other; share of such pairs, of all."""
@@ -305,7 +305,7 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     """
     if not len(gnss):
         raise InputError("gnss", "no run", "must have at least one", "Use observe(..., runs=1).")
-    arrays = {"gnss": (gnss, FARTHEST), "velocity": (velocity, FASTEST), "relative": (relative, FARTHEST)}
+    arrays = {"gnss": (gnss, MAX_POSITION), "velocity": (velocity, MAX_SPEED), "relative": (relative, MAX_POSITION)}
     for name, (values, limit) in arrays.items():
         plausible(name, values, limit)
         if np.isfinite(values.sum()):  # which needs no array of its own
@@ -381,7 +381,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
     sentences = [
         f"{name} is {std:.3g} rad, which is {np.rad2deg(std):.0f}°"
         for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std")
-        if (std := getattr(sensors, name)) > WIDE
+        if (std := getattr(sensors, name)) > DEGREES_STD
     ]
     if v2x.latency > v2x.max_age and len(recording.links):
         sentences.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
@@ -391,10 +391,10 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
 
 
 def _contradicting(recording: Recording) -> float:
-    """Share of the pairs of fixes of the first run, `LAG` s apart, that contradict the odometry between them; 0 below
-    `SHARE`, and where too little moves. Without a heading only the lengths are compared."""
+    """Share of the pairs of fixes of the first run, `COMPARED_SECONDS` s apart, that contradict the odometry between
+    them; 0 below `CONTRADICTING_SHARE`, and where too little moves. Without a heading only lengths are compared."""
     body, stated = recording.body, float(np.hypot(*recording.sensors.fix_std[:2]))
-    lag = max(1, min(len(recording.t) - 1, round(LAG / recording.dt)))
+    lag = max(1, min(len(recording.t) - 1, round(COMPARED_SECONDS / recording.dt)))
     fixes, u = (values[0, ..., :2] @ [1, 1j] for values in (recording.gnss, recording.velocity))
     heading: Floats = np.zeros(u.shape)
     turned = heading
@@ -410,8 +410,8 @@ def _contradicting(recording: Recording) -> float:
     rough = np.abs(np.diff(fixes, 2, axis=0))  # of white noise sqrt(6) times a fix's
     noise = max(np.median(rough[np.isfinite(rough)]) / 2.0 if np.isfinite(rough).any() else 0.0, stated)
     short, long = np.sort([np.abs(moved), np.abs(driven)], axis=0)
-    far = (long > LONG * noise) & (short > noise)
+    far = (long > LONG_STDS * noise) & (short > noise)
     far &= (newest[:-1] >= 0) & (np.diff(newest, axis=0) > 0) & (gaps == 0)
-    apart = far & (np.abs(moved - driven) > APART * (np.abs(moved) + np.abs(driven)))
+    apart = far & (np.abs(moved - driven) > APART_SHARE * (np.abs(moved) + np.abs(driven)))
     share = float(apart.sum() / max(far.sum(), 1))
-    return share if share > SHARE and far.sum() > 2 else 0.0
+    return share if share > CONTRADICTING_SHARE and far.sum() > 2 else 0.0

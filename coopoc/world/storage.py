@@ -31,7 +31,7 @@ NAMES = (
     *(f"links_{name}" for name in LINKS),
     *(f"truth_{n}" for n in ("position", "velocity", BODY[1])),
 )
-LARGEST, DENSEST = 2**31, 1032
+MAX_BYTES, MAX_INFLATION = 2**31, 1032
 """Bytes of one unpacked file, and of each of its own: no deflated stream unpacks to more."""
 
 
@@ -61,12 +61,12 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
 
 
 def unpacked(path: Path) -> dict[str, AnyArray]:
-    """Arrays of an .npz file by name; ValueError for more than `LARGEST` bytes, and what zipfile and NumPy raise."""
+    """Arrays of an .npz file by name; ValueError for more than `MAX_BYTES` bytes, and what zipfile and NumPy raise."""
     with zipfile.ZipFile(path) as packed:
-        if (size := sum(part.file_size for part in packed.infolist())) > LARGEST:
+        if (size := sum(part.file_size for part in packed.infolist())) > MAX_BYTES:
             raise ValueError("more than 2 GB unpacked (too many runs?)")
-        if size > DENSEST * path.stat().st_size:
-            raise ValueError(f"{size} bytes unpacked, more than {DENSEST} times those of the file")
+        if size > MAX_INFLATION * path.stat().st_size:
+            raise ValueError(f"{size} bytes unpacked, more than {MAX_INFLATION} times those of the file")
         _check_shapes(packed)
     with np.load(path, allow_pickle=False) as stored:
         return dict(stored)

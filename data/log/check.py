@@ -13,17 +13,17 @@ from coopoc.evaluate.metrics import dimensions
 from coopoc.workers import progress_bar
 
 from .estimates import (
-    ALIKE,
     BEHIND,
     BESIDE,
-    DRIFT,
-    ENOUGH,
-    FAST,
-    LATE,
+    LEAST_CORRELATION,
+    LEAST_COUNT,
+    LEAST_DRIFT,
+    LEAST_LAG,
+    LEAST_SCALE,
+    LEAST_TURN,
+    LONG_LAG,
     OUTLYING,
-    SCALE,
-    SURELY,
-    TURNED,
+    SURE_ERRORS,
     Estimate,
     against_truth,
     causes,
@@ -38,7 +38,7 @@ from .estimates import (
 from .estimates import median as median_of
 from .motion import CLOCKWISE, HOLDS
 from .read import Log
-from .relative import OUTLIERS, SEVERAL, long_off, measurements, of_measurements, of_ranges, when
+from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, long_off, measurements, of_measurements, of_ranges, when
 from .residuals import Check, filtered
 from .unseen import unseen
 
@@ -49,15 +49,15 @@ MISTAKEN = (
     (3.0, 3.6, "Are positions in feet? They are in m."),
 )
 """Ratios of the distance of fixes to that of odometry (least, largest), and the unit that explains them."""
-FEW, APART = 5, 1.5
+LEAST_FIXES, FRAME_STDS = 5, 1.5
 """Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
-SIGMAS = 6.0
+OFFSET_ERRORS = 6.0
 """Standard errors of an offset beyond which it is no chance."""
-ARM, LONGEST_ARM = 0.2, 30.0
+LEAST_ARM, LONGEST_ARM = 0.2, 30.0
 """m, least arm of an antenna that is reported, and longest that is one."""
-CONFIDENT = 3.0
+CONFIDENT_RATIO = 3.0
 """Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
-UNUSED = 0.05
+UNUSED_SHARE = 0.05
 """Share of what was logged that may be left out without a word."""
 DIVERGED = 0.3
 """Share of its speeds that no odometry errs by, so that a filter that estimates it has diverged."""
@@ -169,12 +169,12 @@ def _axes(c: Check, column: int) -> str:
     u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
     height, climbed = rec.gnss[0, :, column, 2], np.cumsum(np.nan_to_num(rec.velocity[0, :, column, 2])) * rec.dt
     up, climbed = (each[np.isfinite(height)] for each in (height, climbed))
-    if len(up) > ENOUGH and np.ptp(climbed) > 4 * rec.sensors.fix_std[2] and np.corrcoef(up, climbed)[0, 1] < -0.9:
+    if len(up) > LEAST_COUNT and np.ptp(climbed) > 4 * rec.sensors.fix_std[2] and np.corrcoef(up, climbed)[0, 1] < -0.9:
         return "heights of fixes fall where vz is positive: it counts upwards, so that scale=vz:-1 mends it."
-    if not size or abs(np.vdot(driven, moved)) > ALIKE * size:
+    if not size or abs(np.vdot(driven, moved)) > LEAST_CORRELATION * size:
         return ""
     mirror = np.vdot(driven.conj(), moved)
-    if abs(mirror) > ALIKE * size:
+    if abs(mirror) > LEAST_CORRELATION * size:
         return (
             f"axes look swapped or mirrored: fixes move as odometry mirrored at {np.angle(mirror, deg=True) / 2:.0f}"
             " deg from +x. At 45, swap easting and northing, latitude and longitude, or vx and vy; headings clockwise "
@@ -196,8 +196,8 @@ def _of_rows(c: Check) -> list[str]:
     share = max(
         sum(used) / max(sum(used) + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or np.inf)
     )
-    held = left.get(HOLDS, 0) > FEW
-    if share > UNUSED or held:
+    held = left.get(HOLDS, 0) > LEAST_FIXES
+    if share > UNUSED_SHARE or held:
         why = HOLDS if held else max(left, key=lambda reason: left[reason])
         hint = next((hint for begin, hint in ADVICE.items() if why.startswith(begin)), "")
         first = summary.refused[why][1]
@@ -218,7 +218,7 @@ def _of_errors(c: Check) -> list[str]:
         f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what other lines name, or by "
         "noise that is not as stated."
         for row in sorted(c.vehicles, key=lambda row: -(row.get("error_per_std") or 0.0))
-        if (row.get("error_per_std") or 0.0) > CONFIDENT
+        if (row.get("error_per_std") or 0.0) > CONFIDENT_RATIO
     ]
 
 
@@ -231,15 +231,15 @@ def _of_vehicles(c: Check) -> list[str]:
         there = np.isfinite(c.normalised[:, column])
         square = size * c.normalised[there, column]
         outliers = 0.0
-        if len(square) > ENOUGH:
+        if len(square) > LEAST_COUNT:
             usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04)
             outliers = np.mean(square > OUTLYING**2 * usual)
-        if outliers > max(OUTLIERS, SEVERAL / max(len(square), 1)):
+        if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / max(len(square), 1)):
             sentences.append(
                 f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
                 "outliers, which a filter without a gate follows."
             )
-        if nis is not None and row["fixes"] > ENOUGH and not 0.2 <= nis <= 2:
+        if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= 2:
             word = "larger" if nis > 2 else "smaller"
             part = when((c.world.t - c.world.t[0])[there], long_off(square / size))
             cause = f"Most are{part}: is one of the two held?" if part else "Give std columns or sensors=."
@@ -259,7 +259,7 @@ def _of_vehicles(c: Check) -> list[str]:
             )
         east, north = row.get("beside_east", 0.0), row.get("beside_north", 0.0)
         unsure = np.hypot(row.get("beside_east_error", 0.0), row.get("beside_north_error", 0.0))
-        if np.hypot(east, north) > max(BESIDE, SURELY * unsure):
+        if np.hypot(east, north) > max(BESIDE, SURE_ERRORS * unsure):
             sentences.append(
                 f"{name}: it moves by {np.hypot(east, north):.2f} +- {unsure:.2f} m/s towards "
                 f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
@@ -274,19 +274,19 @@ def _of_vehicles(c: Check) -> list[str]:
                 "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
             )
             continue
-        elif row.get("speed_excess") is not None and _beyond(row, "speed_excess", SCALE):
+        elif row.get("speed_excess") is not None and _beyond(row, "speed_excess", LEAST_SCALE):
             word = "fast" if row["speed_excess"] > 0 else "slow"
             sentences.append(
                 f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
                 f"{100 * row['speed_excess_error']:.2f} %: multiply its speeds by "
                 f"{1 / (1 + row['speed_excess']):.4g}, or take a pose filter, which estimates it."
             )
-        if _beyond(row, "yaw_rate_bias", DRIFT):
+        if _beyond(row, "yaw_rate_bias", LEAST_DRIFT):
             sentences.append(
                 f"{name}: its yaw rates are too large by {row['yaw_rate_bias']:.2g} +- "
                 f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
             )
-        if turn is not None and abs(turn) <= 20 and _beyond(row, "turned", TURNED):
+        if turn is not None and abs(turn) <= 20 and _beyond(row, "turned", LEAST_TURN):
             sentences.append(
                 f"{name}: its odometry is turned by {np.rad2deg(row['turned']):.2f} +- "
                 f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, the mounting of a sensor, "
@@ -303,17 +303,17 @@ def _of_vehicles(c: Check) -> list[str]:
 
 def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
     """Whether an estimate of a row is larger than that, and than chance."""
-    return float(abs(row.get(name) or 0.0)) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
+    return float(abs(row.get(name) or 0.0)) > max(least, SURE_ERRORS * (row.get(f"{name}_error") or 0.0))
 
 
 def _late(c: Check, row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row is late beside the truth."""
-    return _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt))
+    return _beyond(row, "late_s", max(LEAST_LAG, 0.5 * c.world.dt))
 
 
 def _drifts(row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row errs."""
-    errors = ("speed_excess", SCALE), ("turned", TURNED), ("yaw_rate_bias", DRIFT)
+    errors = ("speed_excess", LEAST_SCALE), ("turned", LEAST_TURN), ("yaw_rate_bias", LEAST_DRIFT)
     return any(_beyond(row, *one) for one in errors)
 
 
@@ -346,9 +346,9 @@ def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
     used = np.isfinite(off[:, column])
     noise = c.fix_noise * max(row.get("nis") or 1.0, 1.0) ** 0.5
     (ahead,), (unsure,) = factors(off[used, column], made[2:, used, column].T, noise)
-    if abs(ahead + late) > SURELY * np.hypot(unsure, row["late_s_error"]):
+    if abs(ahead + late) > SURE_ERRORS * np.hypot(unsure, row["late_s_error"]):
         return ", its fixes are not: is a velocity the mean of the interval before its stamp, which is half of it late?"
-    if abs(ahead) > SURELY * unsure:
+    if abs(ahead) > SURE_ERRORS * unsure:
         return f", as its fixes are: its clock differs from that of the truth. {mends} mends it."
     return f": its clock differs, which {mends} mends, or velocities are means of the interval before their stamps."
 
@@ -367,8 +367,8 @@ def _of_fixes(c: Check) -> list[str]:
         for share in ([1, 1, 1], [0, 0, 1]):  # without an arm that is sure a clock may explain it all
             x, z = (each[:, finite, column].T * share for each in (made, then))
             factor, std = factors(off[finite, column], x, usual, every_one, z=z)
-            sure = np.abs(factor) > SIGMAS * std * max(row.get("nis") or 1.0, 1.0) ** 0.5
-            if (sure & (np.abs(factor) > ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM:
+            sure = np.abs(factor) > OFFSET_ERRORS * std * max(row.get("nis") or 1.0, 1.0) ** 0.5
+            if (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM:
                 sentences.append(
                     f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
                     f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {'odometry' if truth is None else 'truth'}: "
@@ -376,7 +376,7 @@ def _of_fixes(c: Check) -> list[str]:
                 )
                 break
         wrong = max(row.get("nis") or 0.0, row.get("error_per_std") or 0.0) > OUTLYING
-        if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= FAST:
+        if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             way = "behind" if lag > 0 else "ahead of"
             sentences.append(
                 f"{name}: its fixes are {abs(lag):.0f} s {way} the {'odometry' if truth is None else 'truth'}, which "
@@ -387,7 +387,7 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         derived = truth is None and rec.sensors.velocity_reading == "fixes"
         derived |= truth is None and _off(row)  # what draws positions aside draws them along a bend, too
-        if sure[2] and abs(lag := factor[2]) >= LATE and not derived:
+        if sure[2] and abs(lag := factor[2]) >= LEAST_LAG and not derived:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(
                 f"{name}: its fixes are {abs(lag):.2f} s {way} the {'odometry' if truth is None else 'truth'} along "
@@ -399,15 +399,15 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         every = rec.gnss[0, :, column] - truth.position[:, column]
         both = np.isfinite(every[:, 0])
-        if both.sum() < FEW:
+        if both.sum() < LEAST_FIXES:
             continue
         east, north, up = (median_of(axis) for axis in every[both].T)
-        if np.ptp(rec.gnss[0, both, column, 2]) and abs(up[0]) > max(SIGMAS * up[1], rec.sensors.fix_std[2] / 2):
+        if np.ptp(rec.gnss[0, both, column, 2]) and abs(up[0]) > max(OFFSET_ERRORS * up[1], rec.sensors.fix_std[2] / 2):
             sentences.append(
                 f"{name}: fixes lie {up[0]:.3g} m above the truth in the median. Is one of the two above the "
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
-        unsure = min(SIGMAS * np.hypot(east[1], north[1]), APART * usual)
+        unsure = min(OFFSET_ERRORS * np.hypot(east[1], north[1]), FRAME_STDS * usual)
         if np.hypot(east[0], north[0]) > max(unsure, usual / 2):
             theirs = np.linalg.norm(rec.gnss[0, :, column, None, :2] - truth.position[..., :2], axis=-1)
             like = [one for one, far in zip(rec.ids, pd.DataFrame(theirs[both]).median(), strict=True) if far < usual]

@@ -15,27 +15,27 @@ from coopoc.world.links import wrap
 from .motion import MOVING
 from .residuals import Check, filtered, plane, residual_of
 
-SURELY = 4.0
+SURE_ERRORS = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
-LATE, SCALE, TURNED, DRIFT = 0.02, 0.01, 0.02, 2e-3
+LEAST_LAG, LEAST_SCALE, LEAST_TURN, LEAST_DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 BESIDE, BEHIND = 0.1, 0.5
 """m/s, least velocity beside that of the odometry that is reported, and s, least lag of fixes behind it."""
 UNITS_APART = 0.2
 """Share by which lengths are off from which their unit is wrong."""
-ENOUGH = 20
+LEAST_COUNT = 20
 """Measurements from which a statistic is reported."""
-FAR = 10.0
+MOVED_STDS = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
-ALIKE = 0.97
+LEAST_CORRELATION = 0.97
 """Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
 ALONE = 0.02
 """Share of a cause, squared, that no others may make up, so that it can be told from them."""
 OUTLYING, BLOCKS = 5.0, 10
 """Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
-FAST = 2.0
+LONG_LAG = 2.0
 """s, from which a lag is looked for, not estimated."""
-LONGEST, LAG = 60.0, 0.1
+LONGEST_LAG, LAG_STEP = 60.0, 0.1
 """s, of lags that are looked for, and from one to the next."""
 VARIED, NUDGE = 0.15, 0.01
 """Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
@@ -69,7 +69,7 @@ def factors(
     """
     k, all_of = x.shape[1], np.column_stack([y, x] if z is None else [y, x, z])
     none = Estimate(np.zeros(k), np.full(k, np.inf))
-    if len(y) < ENOUGH:
+    if len(y) < LEAST_COUNT:
         return none
     if groups is not None:
         all_of = _centred(all_of, groups)
@@ -144,7 +144,7 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     pace = np.gradient(path, rec.dt)
     numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(axis=2)
     (fixes, path), gaps = numbers[:2], gaps[parts[:, 0]]
-    times = FAR if means == 1 else FAR / 3
+    times = MOVED_STDS if means == 1 else MOVED_STDS / 3
     for places, far in ((path, times), (fixes, 2 * times)):
         pairs, last = [], 0
         for k in range(1, len(parts)):
@@ -166,7 +166,7 @@ def ratio_of_moves(c: Check, column: int) -> complex | None:
     """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
     moved, driven, *_ = moves(c, column)
     ratio: complex = np.vdot(driven, moved) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
-    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - ALIKE**2) ** 0.5 * np.linalg.norm(moved))
+    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - LEAST_CORRELATION**2) ** 0.5 * np.linalg.norm(moved))
     return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
 
 
@@ -190,8 +190,8 @@ def odometry(c: Check, column: int) -> Estimate:
         return Estimate(value, np.hypot(error, [attenuation, 0.0, 0.0, 0.0, 0.0]))
     if truth is None:
         moved, driven, turns, bends, span = moves(c, column)
-        if len(moved) < ENOUGH:
-            means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * ENOUGH // 2)
+        if len(moved) < LEAST_COUNT:
+            means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2)
             moved, driven, turns, bends, span = moves(c, column, max(means, 2))
         square = max(np.square(np.abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
@@ -202,7 +202,9 @@ def odometry(c: Check, column: int) -> Estimate:
             return none
         value[:2], value[2] = _polar(1 / turned), -value[2]
         error[:2] = np.hypot(error[:2], attenuation) / abs(turned) ** 2
-        if abs(value[2]) > max(BEHIND, SURELY * error[2]):  # smoothed fixes cut bends: speeds and directions seem wrong
+        if abs(value[2]) > max(
+            BEHIND, SURE_ERRORS * error[2]
+        ):  # smoothed fixes cut bends: speeds and directions seem wrong
             error[[0, 1, 3, 4]] = np.inf
         return Estimate(value, error)
     path = plane(truth.position[:, column])
@@ -219,7 +221,7 @@ def odometry(c: Check, column: int) -> Estimate:
     value, error = _of_motion((odometer - true)[used], x[:, used], constant, usual)
     late = -value[2] / max(1 + value[0], 0.1)
     value[:3] = *_polar(1 + complex(*value[:2])), late
-    error[2] = error[2] if abs(late) < FAST else np.inf  # what is linear in a lag holds for small ones
+    error[2] = error[2] if abs(late) < LONG_LAG else np.inf  # what is linear in a lag holds for small ones
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
@@ -286,7 +288,7 @@ def clocks(c: Check, reference: int | None) -> tuple[Estimate, AnyArray]:
     def against(value: Floats) -> Floats:
         seen = np.flatnonzero(x[:, :size].any(axis=0))
         apart = np.abs(np.subtract.outer(value[seen], value[seen]))
-        most = seen[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))] if len(seen) else 0
+        most = seen[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))] if len(seen) else 0
         less[:size, most if reference is None else reference] -= 1.0
         return less
 
@@ -321,7 +323,7 @@ def share(c: Check) -> float:
 
 def median(values: Floats) -> tuple[float, float]:
     """Median, and its standard error by the medians of parts of the drive; infinite of too few."""
-    if len(values) < ENOUGH:
+    if len(values) < LEAST_COUNT:
         return 0.0, np.inf
     parts = [np.median(part) for part in np.array_split(values, BLOCKS)]
     return float(np.median(values)), float(np.std(parts) / np.sqrt(BLOCKS - 1.0))
@@ -361,21 +363,21 @@ def lag_of_fixes(c: Check, column: int) -> float:
     velocity = plane(rec.velocity[0, :, column])
     path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
     path = path if truth is None else plane(truth.position[:, column])
-    fixes, most, every = plane(rec.gnss[0, :, column]), int(LONGEST / rec.dt), max(round(LAG / rec.dt), 1)
+    fixes, most, every = plane(rec.gnss[0, :, column]), int(LONGEST_LAG / rec.dt), max(round(LAG_STEP / rec.dt), 1)
     at = np.flatnonzero(np.isfinite(fixes))
     for steps in range(-(most // every) * every, most + 1, every):
         then = at[(at >= steps) & (at < len(path) + steps)]
         off = fixes[then] - path[then - steps]
         off = off[np.isfinite(off)]
         if len(off) > len(at) / 2:
-            part = np.arange(len(off)) // ENOUGH
+            part = np.arange(len(off)) // LEAST_COUNT
             mean = (np.bincount(part, off.real) + 1j * np.bincount(part, off.imag)) / np.bincount(part)
             misses[steps] = float(np.median(np.abs(off - mean[part])))
     least = min(misses.values(), default=np.inf)
     if least > min(OUTLYING * c.fix_noise, misses.get(0, 0.0) / 2):
         return 0.0
     first = min((steps for steps, miss in misses.items() if miss < 1.05 * least), key=abs)  # of a way that repeats
-    return min((steps for steps in misses if abs(steps - first) * rec.dt < FAST), key=misses.__getitem__) * rec.dt
+    return min((steps for steps in misses if abs(steps - first) * rec.dt < LONG_LAG), key=misses.__getitem__) * rec.dt
 
 
 def _beside(off: AnyArray, velocity: AnyArray) -> float:
@@ -415,8 +417,8 @@ def on_time(c: Check, alike: bool = True) -> Check:
         reference = int(np.argmin(np.where(covered, np.abs(seconds), np.inf))) if covered.any() else None
     estimate, made = clocks(c, reference)
     size, error = len(c.world.ids), estimate.error
-    least = np.where(np.arange(size + 2) == size, SCALE, LATE)
-    off = np.where(np.abs(estimate.value) > np.maximum(SURELY * error, least), estimate.value, 0.0)
+    least = np.where(np.arange(size + 2) == size, LEAST_SCALE, LEAST_LAG)
+    off = np.where(np.abs(estimate.value) > np.maximum(SURE_ERRORS * error, least), estimate.value, 0.0)
     off[size:] *= alike & (abs(off[size]) < UNITS_APART)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ off)

@@ -29,11 +29,11 @@ SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
 """m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
-MANY, LEAPS = 10, 10.0
+LOCATING_FIXES, LEAPS = 10, 10.0
 """Fixes of a vehicle that show where it is; times its usual speed, to and from a fix that is none."""
-SELDOM = 0.02
+DISORDER_SHARE = 0.02
 """Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
-ALIKE = 0.1
+EQUAL_LOG_FACTOR = 0.1
 """Logarithm of a factor of deviations that is none."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
@@ -52,7 +52,7 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
             summary.assume(f"stamps begin anew after {period:g} s: those before half of it count on")
             early = {name: rows[name].mask(rows[name] < period / 2, rows[name] + period) for name in ("t", "arrival")}
             return rows.assign(**early)
-    if 0 < back.mean() < SELDOM:
+    if 0 < back.mean() < DISORDER_SHARE:
         who = ", ".join(rows["vehicle"][back].unique())
         summary.assume(
             f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set; rows are in their order"
@@ -145,7 +145,7 @@ def _nowhere(rows: Rows) -> Bools:
     leap = at_zero != pd.Series(at_zero, fixes.index).groupby("vehicle").shift(fill_value=False).to_numpy()
     usual = pace[~at_zero & ~leap].groupby("vehicle").agg(["size", lambda each: each.quantile(0.8)])
     least = pace[leap].groupby("vehicle").min().reindex(usual.index)
-    away = usual.index[(least > LEAPS * usual.iloc[:, 1]) & (usual["size"] >= MANY)]
+    away = usual.index[(least > LEAPS * usual.iloc[:, 1]) & (usual["size"] >= LOCATING_FIXES)]
     zero = zero[zero["kind"].isin(ENU) | zero["vehicle"].isin(away)]
     at = rows.set_index(key).index.isin(zero.set_index(key).index)
     return np.asarray(at & in_group(rows, "fix"))
@@ -227,7 +227,7 @@ def fix_factors(rows: Rows, ids: Sequence[str]) -> tuple[float, ...]:
     fixes = only(rows, "x", "y")
     square = np.square(fixes["std"])
     factor = np.sqrt(square.groupby(fixes["vehicle"]).mean() / square.mean()).reindex(ids).fillna(1.0)
-    return tuple(factor.tolist()) if (np.abs(np.log(factor)) > ALIKE).any() else ()
+    return tuple(factor.tolist()) if (np.abs(np.log(factor)) > EQUAL_LOG_FACTOR).any() else ()
 
 
 def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:

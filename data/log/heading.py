@@ -9,7 +9,7 @@ import scipy
 from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.world.links import wrap
 
-from ..assemble import SAME
+from ..assemble import SAME_INSTANT
 
 BASELINE = 10.0
 """Standard deviations of a fix, by which two must be apart to show a direction: to 0.14 rad."""
@@ -75,7 +75,7 @@ class Reckoning(NamedTuple):
 
     def parts(self, gap: float) -> "Iterator[Reckoning]":
         """Between gaps of the yaw rate, which nothing leads across."""
-        for t in np.split(self.yaw_rate.t, np.flatnonzero(np.diff(self.yaw_rate.t) > gap + SAME) + 1):
+        for t in np.split(self.yaw_rate.t, np.flatnonzero(np.diff(self.yaw_rate.t) > gap + SAME_INSTANT) + 1):
             fixes, speed, rate = (
                 Signal(signal.t[inside], signal.value[inside])
                 for signal in (self.fixes, self.speed, self.yaw_rate)
@@ -228,7 +228,7 @@ def held(signal: Signal, at: Floats) -> Floats:
     >>> held(Signal(np.array([0.0, 1]), np.array([[5.0], [6]])), np.array([-1.0, 0, 0.9, 1])).ravel().tolist()
     [nan, 5.0, 5.0, 6.0]
     """
-    last = np.searchsorted(signal.t, at + SAME, side="right") - 1
+    last = np.searchsorted(signal.t, at + SAME_INSTANT, side="right") - 1
     return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], np.nan)
 
 
@@ -240,8 +240,10 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
     """
     right = np.clip(np.searchsorted(t, at), min(1, len(t) - 1), len(t) - 1)
     left = np.maximum(right - 1, 0)
-    between = (at >= t[left] - SAME) & (at <= t[right] + SAME) & (t[right] - t[left] <= gap + SAME)
-    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME
+    between = (
+        (at >= t[left] - SAME_INSTANT) & (at <= t[right] + SAME_INSTANT) & (t[right] - t[left] <= gap + SAME_INSTANT)
+    )
+    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME_INSTANT
     return between | near
 
 

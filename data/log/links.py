@@ -16,7 +16,7 @@ from .units import Rows, Summary, in_group, only, stated_std
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
 PAIR = ["step", "observer", "neighbour"]
-NEAR, APART = 10.0, 4.0
+NEAR_RATIO, APART = 10.0, 4.0
 """Distances, over what the two move until the step, and over the standard deviation of a fix, below both of which a
 direction is not known well enough."""
 RADAR = "{} ranges beside a direction count for who measured them alone: a radar's partner does not know them"
@@ -184,9 +184,9 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
 def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, std: float) -> tuple[Floats, Bools]:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
-    their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR times lag du.
-    Nothing is moved where g or du is not known. In body frames a bearing grows by lag w, too, with the observer's yaw
-    rate w.
+    their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_RATIO times
+    lag du. Nothing is moved where g or du is not known. In body frames a bearing grows by lag w, too, with the
+    observer's yaw rate w.
     """
     velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
@@ -209,6 +209,6 @@ def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, s
     change[:, 1:] = wrap(change[:, 1:])
     distance = np.where(component == 0, value, np.inf)
     gap, moved = np.minimum(np.linalg.norm(now, axis=1), distance), np.linalg.norm(now - then, axis=1)
-    vague = (gap <= NEAR * moved) & (gap <= std)
+    vague = (gap <= NEAR_RATIO * moved) & (gap <= std)
     value = value + np.where(vague, 0.0, np.nan_to_num(change[np.arange(len(change)), component]))
     return np.where(component == 1, wrap(value), value), vague

@@ -13,7 +13,7 @@ from coopoc.kernels.constant_velocity import BANK, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
-from ..assemble import SAME, longest_gap, nearest, steps_of
+from ..assemble import SAME_INSTANT, longest_gap, nearest, steps_of
 from .heading import (
     Course,
     Reckoning,
@@ -30,7 +30,7 @@ from .units import Rows, Summary, in_group, only, place, stated_std
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
-SURE = 3.0
+SHOWN_STDS = 3.0
 """Standard deviations of a velocity that fixes have shown, above which it is one."""
 STANDS = 0.5
 """m/s, a speed below which what has no heading is taken to stand."""
@@ -325,7 +325,7 @@ def _heading(measured: Signal, world: Signal | None, shown: Shown, way: Reckonin
         sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
-        if (moving := (pace > np.maximum(MOVING, SURE * unsure)) & certain).any():
+        if (moving := (pace > np.maximum(MOVING, SHOWN_STDS * unsure)) & certain).any():
             courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
             return Course(courses, source, wanders, float(np.median(unsure[moving] / pace[moving])))
     return Course()
@@ -363,7 +363,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     between = np.diff(fixes.t)
     interval, longest = float(np.median(between)), np.quantile(between, 0.9)
     velocity, growth, spread, proved = constant_velocity(
-        fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, variance, UNKNOWN_SPEED, BANK
+        fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
     )
     sure, order = np.isfinite(growth), np.arange(len(growth))
     since = order - np.maximum.accumulate(np.where(sure, 0, order))
@@ -374,7 +374,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
 
 def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:
     """(T, 3) m/s at each step, as fixes of the steps before have shown it; until then it leads from fix to fix."""
-    arrived = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME) - 1
+    arrived = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME_INSTANT) - 1
     last = np.append(-1, arrived[:-1])
     new = (last >= 0) & (arrived > last)
     leads = np.where(new[:, None], (fixes.value[arrived] - fixes.value[last]) / steps.dt, 0.0)

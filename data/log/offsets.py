@@ -8,7 +8,7 @@ from .estimates import against_truth, offsets, on_time
 from .read import Log
 from .residuals import filtered
 
-FIRST = 0.4
+SHOWING_SHARE = 0.4
 """Share of a log that shows by what its ranges are too long."""
 
 
@@ -20,7 +20,7 @@ def less_offsets(log: Log) -> Log:
     Raises:
         InputError: as `check`.
     """
-    rec, until, by = log.recording, FIRST * float(np.ptp(log.recording.t)), "filters of each vehicle alone show"
+    rec, until, by = log.recording, SHOWING_SHARE * float(np.ptp(log.recording.t)), "filters of each vehicle alone show"
     c = on_time(filtered(log.part(until=until)))
     if c.log.truth is not None and not c.ahead.any():
         c, by = replace(against_truth(c), variance=0 * c.variance), "the truth shows"

@@ -12,7 +12,7 @@ from coopoc.text import picture
 
 from .residuals import Check
 
-LONG = 5.0
+LONG_EXTENT = 5.0
 """Extent of a drive, in multiples of its width, above which the axes have two scales, so that lanes are apart."""
 
 
@@ -38,7 +38,7 @@ def draw(result: Check, path: Path) -> Figure:
         when.plot(fixes, 0 * fixes + row, "|", ms=5, mew=0.6, color=color)
     ax.plot(*np.delete(rec.gnss[0, 0, :, :2], moving, axis=0).T, "^", color=INK, ms=8)
     x, y = np.ptp(ax.dataLim.get_points(), axis=0)
-    if max(x, y) > LONG * min(x, y):
+    if max(x, y) > LONG_EXTENT * min(x, y):
         ax.set(aspect="auto", xlabel="East [m], on a scale of its own")
     words = "fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)"
     figure.suptitle(fill(f"{picture(result.log.summary.name)}: {words}", 72), fontsize=9)

@@ -39,9 +39,9 @@ DAY = 86400.0
 """s."""
 LOST = 0.02
 """Most of the fixes that may fall on a step that has one."""
-SHORTEST, LONGEST, PAIR = 0.02, 1.0, ("vehicle", "partner")
+SHORTEST_STEP, LONGEST_STEP, PAIR = 0.02, 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
-OFTEN = 0.1
+FREQUENT_SHARE = 0.1
 """Share of the measurements of the most frequent vehicle, or pair, from which one counts for the step."""
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
@@ -57,7 +57,7 @@ TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 COARSE = 0.5
 """s between samples of a truth, from which lines between them are no way that was driven, and within which of one the
 curve through them is."""
-APART = 3600.0
+DRIVES_APART = 3600.0
 """s between the files of a folder, and longer than all of them together: they are of several drives."""
 
 
@@ -375,7 +375,7 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
     begins, ends = spans["min"].to_numpy(), np.maximum.accumulate(spans["max"].to_numpy())
     gaps = begins[1:] - ends[:-1]
     covered = ends[-1] - begins[0] - gaps.clip(0.0).sum() if len(spans) else 0.0
-    if (gaps > max(APART, covered)).any():
+    if (gaps > max(DRIVES_APART, covered)).any():
         raise InputError(
             path.name,
             "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
@@ -419,7 +419,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
 
     def densest(group: str, *keys: str) -> float:
         times = rows[in_group(rows, group)].drop_duplicates([*keys, "t"]).sort_values("t").groupby(list(keys))["t"]
-        return float(times.agg(lambda t: t.diff().median())[times.size() >= OFTEN * times.size().max()].min())
+        return float(times.agg(lambda t: t.diff().median())[times.size() >= FREQUENT_SHARE * times.size().max()].min())
 
     moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
     t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
@@ -435,12 +435,12 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
     if dt is None:
-        dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
+        dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST_STEP):.3g}")
         if dense < step:
             seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
             summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
             step = dense
-        seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
+        seldom = float(f"{min(pairs, fixes, LONGEST_STEP):.3g}")  # unknown where there are no pairs
         if not body and pairs > step and seldom > step:
             often = f"odometry every {step:g} s is averaged"
             summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; {often}")

@@ -8,13 +8,13 @@ import pandas as pd
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
-from .estimates import ENOUGH, FAR, OUTLYING, SURELY, by_pair, offsets
+from .estimates import LEAST_COUNT, MOVED_STDS, OUTLYING, SURE_ERRORS, by_pair, offsets
 from .frames import UNSTATED
 from .motion import MOVING
 from .residuals import Check, plane
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
-WIDE, NARROW = 2.0, 0.4
+WIDE_RATIO, NARROW_RATIO = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
 COARSE, EXACT = 0.5, 1e-3
 """rad: no sensor's angles scatter as much about positions that are better known; least share of a stated deviation that
@@ -26,11 +26,11 @@ HINTS = {
     "inclination": "Inclinations count from +z, elevations from the horizon.",
 }
 """What to look for where measurements of a kind miss the positions."""
-OUTLIERS, SEVERAL = 0.01, 3
+OUTLIER_SHARE, LEAST_OUTLIERS = 0.01, 3
 """Share of measurements beyond 5 standard deviations that is reported, if these are more than several."""
 WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
-SOLID, MANY = 0.8, 4
+WRONG_SHARE, NAMED_CASES = 0.8, 4
 """Share of a part of a drive in which something is wrong, and of the drive that such a part may be; cases that a
 sentence names."""
 
@@ -83,13 +83,13 @@ def of_measurements(c: Check) -> list[str]:
     sentences, links = [], c.world.links
     for row in c.measurements:
         name, unit, number, median, std, least, should, noise, outliers = row.values()
-        if number < ENOUGH:
+        if number < LEAST_COUNT:
             continue
         word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
         hint = HINTS[name]
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = max(should**2 - least**2, 0.0) ** 0.5
-        wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
+        wrong = std > WIDE_RATIO * should or (name == "azimuth" and std > COARSE > 3 * position)
         scaled = False
         if name != "range":
             wrong |= abs(median) > 3 * should
@@ -97,9 +97,9 @@ def of_measurements(c: Check) -> list[str]:
         else:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
-            far = measured + true > 2 * FAR * position
+            far = measured + true > 2 * MOVED_STDS * position
             ratios = measured[far] / np.maximum(true[far], 1e-3)
-            ratio = np.median(ratios) if len(ratios) >= ENOUGH else 1.0
+            ratio = np.median(ratios) if len(ratios) >= LEAST_COUNT else 1.0
             wrong |= (other := not 0.8 <= ratio <= 1.25)
             varied = robust_std(true[far]) > 0.2 * np.median(true[far]) if len(ratios) else False
             powers = np.log10([ratio, 0.3048 * ratio])
@@ -113,7 +113,7 @@ def of_measurements(c: Check) -> list[str]:
         misfits = _misfits(c, k)
         apart = {f"{a} to {b}" if k else f"{a} and {b}" for pair in misfits for a, b in (pair, pair[:: 1 if k else -1])}
         pairs = [one for one in _named(c, k, least) if one[0] not in apart]
-        if outliers > max(OUTLIERS, SEVERAL / number) and not scaled and not misfits:
+        if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / number) and not scaled and not misfits:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
@@ -124,11 +124,11 @@ def of_measurements(c: Check) -> list[str]:
             count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
             ends = set.intersection(*map(set, misfits))
             one = "".join(ends) if len(ends) == 1 else ""
-            worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:MANY]
+            worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:NAMED_CASES]
             sentences.append(
                 f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
                 f"{', '.join(' to '.join(pair) + misfits[pair][1] for pair in worst_of)}"
-                f"{', ...' * (len(misfits) > MANY)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
+                f"{', ...' * (len(misfits) > NAMED_CASES)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
                 "position or clock, or a value that is held."
             )
         if pairs and (not wrong or hint == HINTS["range"]):
@@ -139,7 +139,7 @@ def of_measurements(c: Check) -> list[str]:
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (f"offset={offsets_text} takes it off." if word == "range" else "offset= takes it off.")
             )
-        if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
+        if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):
             size, std_of = ("less", max(noise, EXACT * least)) if noise < least else ("more", noise)
             unstated = name in "".join(c.log.summary.assumed.get(UNSTATED, ()))
             known, hint = ("assumed", "") if unstated else ("stated", " Were variances given as deviations?")
@@ -161,13 +161,13 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
         bad = long_off(np.abs(wrap(less) if k else less) / expected)
-        if len(bad) < ENOUGH:
+        if len(bad) < LEAST_COUNT:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
         x = c.x[links.step[rows]]
         gaps = np.linalg.norm(x - x[:, [one]], axis=2) - measured[rows, None]
         for like, gap in zip(ids, gaps.T, strict=True):
-            if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE * np.median(expected) < 0.2 * size:
+            if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE_RATIO * np.median(expected) < 0.2 * size:
                 text += f", as if to {like}"
         found[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
     return found
@@ -179,7 +179,7 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
     named = [
         (pair, offset, error)
         for pair, (offset, error) in offsets(c, k, stated).items()
-        if abs(offset) > max(SURELY * error, 0.25 * stated)
+        if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated)
     ]
     return sorted(named, key=lambda row: -abs(row[1]))
 
@@ -200,7 +200,7 @@ def _other_angle(c: Check) -> str:
         "azimuths clockwise: change their sign": -2 * measured,
         f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}": -off,
     }
-    enough = {like: np.isfinite(residual + turn).sum() >= ENOUGH for like, turn in causes.items()}
+    enough = {like: np.isfinite(residual + turn).sum() >= LEAST_COUNT for like, turn in causes.items()}
     left = {like: np.nanmedian(np.abs(wrap(residual + causes[like]))) for like in causes if enough[like]}
     if 3 * (least := min(left.values(), default=np.inf)) > np.median(np.abs(residual)):
         return ""
@@ -214,6 +214,6 @@ def long_off(errors: Floats) -> Ints:
 
 def when(t: Floats, bad: Ints) -> str:
     """The part of a drive with samples at t (M,) s that holds those which are bad, if it is one, in words."""
-    if len(bad) < WINDOW or len(bad) < SOLID * (bad[-1] - bad[0]) or len(bad) > SOLID * len(t):
+    if len(bad) < WINDOW or len(bad) < WRONG_SHARE * (bad[-1] - bad[0]) or len(bad) > WRONG_SHARE * len(t):
         return ""
     return f" from {t[bad[0]]:.3g} to {t[bad[-1]]:.3g} s"

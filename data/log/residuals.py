@@ -15,7 +15,7 @@ from coopoc.world.links import spherical, stretches, wrap
 
 from .read import Log
 
-SURE = (0.05, 0.05, 0.01, 0.05)
+TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 """m and rad, of first poses that the truth gives."""
 GATE = 5.0
 """Of the pose filters that check a log: standard deviations beyond which a measurement is left out."""
@@ -120,7 +120,7 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...], str]:
         poses = np.column_stack([truth.position[0], truth.heading[0]])
         if not np.isfinite(poses[moving]).all():
             raise
-        return poses, SURE, ", from the truth's first poses"
+        return poses, TRUE_POSE_STD, ", from the truth's first poses"
 
 
 def _moving(rec: Recording) -> list[int]:

@@ -51,8 +51,8 @@ for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "eleva
     KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
 LIMITS = {name: kind.limit for name, kind in KINDS.items()}
-LEAST = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
-CODES, APART, FEW = 3, 1.4, 10
+LEAST_VALUES = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
+MOST_CODES, LEAP_RATIO, LEAST_MEANT = 3, 1.4, 10
 """Most numbers of a kind that stand for none, and times the largest that can be meant beyond which they are; least rows
 of one that could be meant, and times the usual step from one range of a pair to the next that is a leap."""
 VAGUE, NONSENSE = 30.0, 50.0
@@ -118,11 +118,11 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     own = rows[in_group(rows, "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
     size, limit = value.abs(), kind.map(LIMITS)
-    wrong = (size > limit) | (value < kind.map(LEAST)) | ((kind == "range") & (value == 0.0))
+    wrong = (size > limit) | (value < kind.map(LEAST_VALUES)) | ((kind == "range") & (value == 0.0))
     usual = kind.map(size[~wrong].groupby(kind).max())
-    near = (size > limit) & (size <= APART * usual)  # as of an angle in degrees
+    near = (size > limit) & (size <= LEAP_RATIO * usual)  # as of an angle in degrees
     codes = own[wrong & ~kind.isin(kind[near])].groupby("kind")["value"].agg(["size", "nunique"])
-    few = codes[(codes["nunique"] <= CODES) & (codes["size"] >= 2 * codes["nunique"])]
+    few = codes[(codes["nunique"] <= MOST_CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
     for name in ("range", "speed", "speed_kmh", "z", "height"):
         values = rows[(rows["kind"] == name) & ~rows.index.isin(lost.index)]
@@ -154,7 +154,7 @@ def _leaps(ranges: Rows, number: float) -> Bools:
         ranges["value"][some].groupby(pair).diff().abs()[lambda step: step > 0.0] for some in (same | True, ~same)
     )
     leaps = leaps[same | same.shift(fill_value=False)]
-    often = same.sum() >= FEW and leaps.median() > FEW * plain.quantile(0.8)
+    often = same.sum() >= LEAST_MEANT and leaps.median() > LEAST_MEANT * plain.quantile(0.8)
     return (same & bool(often)).to_numpy()
 
 
@@ -167,7 +167,7 @@ def check_values(rows: Rows) -> None:
     for wrong, column, actual, allowed, hint in (
         (value.abs() > limit, "{kind}", value, "must be within +-{limit:.4g}", UNIT),
         ((kind == "range") & (value <= 0), "{kind}", value, "must be > 0", "Remove the row."),
-        (value < kind.map(LEAST), "{kind}", value, "must be >= 0", "Remove the row."),
+        (value < kind.map(LEAST_VALUES), "{kind}", value, "must be >= 0", "Remove the row."),
         (rows["std"] <= 0, deviation, rows["std"], "must be > 0", "Leave it empty where it is unknown."),
         (alone, "column partner", partner, "must be a name", "Name the vehicle or road-side unit."),
         (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),

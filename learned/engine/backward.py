@@ -12,7 +12,7 @@ from coopoc.learned.engine.layers import (
     FROM_X,
     GATES,
     PAD,
-    SHORTEST,
+    SHORTEST_LENGTH,
     Net,
     Plan,
     aligned,
@@ -199,7 +199,7 @@ def features_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane
         c = at + 3 * change
         u, v, w, p, q, r = tape[c], tape[c + 1], tape[c + 2], gradient[c], gradient[c + 1], gradient[c + 2]
         length, along = tape[lengths + change], u * p + v * q + w * r
-        scale = real(0.0) if length <= real(SHORTEST) else real(1.0) / length
+        scale = real(0.0) if length <= real(SHORTEST_LENGTH) else real(1.0) / length
         gradient[c], gradient[c + 1], gradient[c + 2] = (
             (p - u * along) * scale,
             (q - v * along) * scale,

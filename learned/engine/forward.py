@@ -13,7 +13,7 @@ from coopoc.learned.engine.layers import (
     FROM_X,
     GATES,
     PAD,
-    SHORTEST,
+    SHORTEST_LENGTH,
     Net,
     Plan,
     aligned,
@@ -128,7 +128,7 @@ def features(
             c = at + 3 * change
             u, v, w = own[c], own[c + 1], own[c + 2]
             length = np.sqrt(u * u + v * v + w * w)
-            scale = real(0.0) if length <= real(SHORTEST) else real(1.0) / length
+            scale = real(0.0) if length <= real(SHORTEST_LENGTH) else real(1.0) / length
             own[c], own[c + 1], own[c + 2] = u * scale, v * scale, w * scale
             own[lengths + change] = length
 

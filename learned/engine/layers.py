@@ -19,7 +19,7 @@ SIZE = 3
 """Components of state and measurement, m = n = 3."""
 CELLS = SIZE * SIZE
 """Entries of each covariance-like GRU state."""
-SHORTEST = 1e-12
+SHORTEST_LENGTH = 1e-12
 """Length in m up to which a vector has no direction: its feature is zero and has no gradient."""
 PAD = 16
 """Columns of a gate of a GRU: more than the nine that count, because loops of such a length vectorise."""

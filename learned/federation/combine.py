@@ -15,7 +15,7 @@ SERVER = "server"
 """The server's name in the traffic of a round."""
 FLOAT32 = 4
 """Bytes of a float32."""
-LIMIT = 100.0
+LONGEST_UPDATE = 100.0
 """Longest accepted update, in multiples of the usual one."""
 
 
@@ -38,9 +38,10 @@ def screen(
 ) -> tuple[dict[str, str], float | None]:
     """Reject answers of another shape, with weights that are not finite, or with a change that is far too large.
 
-    With d_i = ||theta_i - theta||, client i is rejected if d_i > LIMIT median_j d_j over the answers of the round. The
-    median of one or two answers is in the hands of one client, and where most answers change nothing it is 0: then the
-    median of the previous round takes its place, and in the first round max(||theta||, 1) is the longest change.
+    With d_i = ||theta_i - theta||, client i is rejected if d_i > LONGEST_UPDATE median_j d_j over the answers of the
+    round. The median of one or two answers is in the hands of one client, and where most answers change nothing it is
+    0: then the median of the previous round takes its place, and in the first round max(||theta||, 1) is the longest
+    change.
 
     Args:
         theta: (P,) weights that the clients received.
@@ -64,9 +65,9 @@ def screen(
         else:
             far[name] = float(torch.linalg.vector_norm(sent.double() - theta.double()))
     if len(far) >= 3 and median(far.values()) > 0:
-        most = LIMIT * median(far.values())
+        most = LONGEST_UPDATE * median(far.values())
     elif usual:
-        most = LIMIT * usual
+        most = LONGEST_UPDATE * usual
     else:
         most = max(float(torch.linalg.vector_norm(theta)), 1.0)
     for name, length in far.items():

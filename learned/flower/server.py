@@ -38,7 +38,7 @@ STRATEGIES: dict[str, tuple[str, dict[str, Any]]] = {
 """Flower's strategy for each rule of `federate`, with the rule's defaults."""
 LARGEST_LOSS = 1e12
 """m^2, the largest plausible loss: an error of 1,000 km."""
-LONGEST = 200
+LONGEST_TEXT = 200
 """Characters of a name or a reason in an answer."""
 MOST_PIECES = 10
 """Times the median of a round: the largest number of pieces with which a client counts. What it claims
@@ -213,7 +213,7 @@ def read(
         node = reply.metadata.src_node_id
         who = names.get(node, f"node {node}")
         if reply.has_error():
-            rejected[who] = visible(str(reply.error.reason)[:LONGEST])
+            rejected[who] = visible(str(reply.error.reason)[:LONGEST_TEXT])
             continue
         try:
             content: Any = reply.content
@@ -247,8 +247,8 @@ def _problem(content: Any, loss: str) -> str:
         return "other records than were asked for"
     name, theirs = (content["client"][key] for key in ("name", "version"))
     pieces, value = content["metrics"]["num-examples"], float(content["metrics"][loss])
-    if not (0 < len(name) <= LONGEST and name.isprintable() and name != SERVER):
-        return f"a name that is not 1 to {LONGEST} printable characters, or the server's"
+    if not (0 < len(name) <= LONGEST_TEXT and name.isprintable() and name != SERVER):
+        return f"a name that is not 1 to {LONGEST_TEXT} printable characters, or the server's"
     if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
         return "a number of pieces that is not in 1..2^31 - 1"
     if not 0 <= value <= LARGEST_LOSS:

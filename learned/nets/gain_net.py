@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from coopoc.arrays import number, seed_of
 
 from ..engine import rollout as engine
-from ..engine.layers import CELLS, SHORTEST, SIZE
+from ..engine.layers import CELLS, SHORTEST_LENGTH, SIZE
 from ..engine.optimiser import Moments, Outcome, Update
 from ..training.clients import Batch
 from .gain import Recurrent, size
@@ -140,4 +140,4 @@ class GainNet(Recurrent):
 def _direction(change: Tensor) -> Tensor:
     """Changes (B, 3) m divided by their lengths, zero where there is none."""
     length = torch.linalg.vector_norm(change, dim=1, keepdim=True)
-    return torch.where(length > SHORTEST, change / length.clamp_min(SHORTEST), 0.0)
+    return torch.where(length > SHORTEST_LENGTH, change / length.clamp_min(SHORTEST_LENGTH), 0.0)

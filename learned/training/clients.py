@@ -16,7 +16,7 @@ from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 Start = Literal["gnss", "true"]
-LONG = 9
+LONG_PIECES = 9
 """Training pieces that a long piece is as long as: 900 steps, the paper's test drive."""
 
 
@@ -179,7 +179,7 @@ def clients(
     fleet = instance("fleet", fleet, Fleet)
     sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)
     recording = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
-    agreed, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
+    agreed, longest = [], min(LONG_PIECES * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
         there = np.flatnonzero(fleet.present[:, column])
         if len(there) and there[-1] - there[0] >= len(there):

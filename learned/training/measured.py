@@ -10,10 +10,10 @@ from coopoc import InputError, Recording
 from coopoc.arrays import Floats, instance, one_of
 from coopoc.world.fleet import columns
 
-from .clients import LONG, Client, Segments, Start, check_pieces
+from .clients import LONG_PIECES, Client, Segments, Start, check_pieces
 from .drives import MeasuredDrives
 
-FEWEST = 20
+LEAST_PIECES = 20
 """Pieces of a vehicle, of which four validate: fewer, longer ones hold too few errors that are independent."""
 Cut = tuple[int, int]
 """Run and first step of a piece."""
@@ -30,7 +30,7 @@ def measured_clients(
 
     A piece begins at a fix and has odometry throughout; fixes may be missing in it, and steps without a truth have no
     loss. It is as long as `piece` fixes take at their median interval, since a filter needs fixes to leave its start
-    behind; shorter, but no less than `piece` steps, where a vehicle would have fewer than FEWEST pieces. The last
+    behind; shorter, but no less than `piece` steps, where a vehicle would have fewer than LEAST_PIECES pieces. The last
     pieces validate: errors of neighbouring pieces are correlated, so that pieces from between those that train would
     hardly be new.
 
@@ -54,7 +54,7 @@ def measured_clients(
     check_pieces(piece, split)
     cols = columns("vehicles", drives.ids, drives.recording.ids)
     piece = _steps(drives.recording, cols, piece)
-    cuts = {n: [list(_cuts(drives, column, n * piece, start)) for column in cols] for n in range(1, LONG + 1)}
+    cuts = {n: [list(_cuts(drives, column, n * piece, start)) for column in cols] for n in range(1, LONG_PIECES + 1)}
     for name, pieces in zip(drives.ids, cuts[1], strict=True):
         if len(pieces) < 2:
             hint = f"It takes {2 * (piece + 1)} steps with odometry, fixes and truth: give more, or shorten the pieces."
@@ -73,7 +73,11 @@ def _steps(recording: Recording, cols: Sequence[int], piece: int) -> int:
     there = np.isfinite(recording.gnss[:, :, cols, 0]).transpose(0, 2, 1).reshape(-1, len(recording.t))
     gaps = np.concatenate([np.diff(np.flatnonzero(row)) for row in there])
     total = min(sum(stop - first for first, stop in recording.stretches(column)) for column in cols)
-    return max(piece, min(piece * int(np.median(gaps)), recording.runs * total // FEWEST - 1)) if len(gaps) else piece
+    return (
+        max(piece, min(piece * int(np.median(gaps)), recording.runs * total // LEAST_PIECES - 1))
+        if len(gaps)
+        else piece
+    )
 
 
 def _cuts(drives: MeasuredDrives, column: int, piece: int, start: Start) -> Iterator[Cut]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...world.links import wrap
-from ...world.plausible import FARTHEST, FASTEST_TURN, UNWRAPPED, radians
+from ...world.plausible import MAX_POSITION, MAX_YAW_RATE, UNWRAPPED, radians
 from ..motion_history import fix_or_none, numbers, three
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class OwnMeasurement:
             heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
         rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
         radians("heading", np.array(heading), UNWRAPPED)
-        radians("yaw_rate", np.array(rate), FASTEST_TURN)
+        radians("yaw_rate", np.array(rate), MAX_YAW_RATE)
         row = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], three("velocity", self.velocity), [rate]])
         self.__dict__["row"] = row
 
@@ -69,7 +69,7 @@ class LandmarkMeasurement:
             values = numbers(getattr(self, name))
             if (
                 values.shape != (3,)
-                or (np.abs(values) > FARTHEST).any()
+                or (np.abs(values) > MAX_POSITION).any()
                 or (name == "position" and np.isnan(values).any())
             ):
                 component, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
