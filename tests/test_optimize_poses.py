@@ -12,7 +12,6 @@ from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
-from coopoc.optimize.assess.assess import as_stated
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.measurements import lookup
 from coopoc.optimize.model.space import Space, exp, log
@@ -76,7 +75,7 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     step = np.zeros(movable.size)
     step[movable] = theirs.x
     assert found.x == pytest.approx(space.retract(truth, step.reshape(9, -1)), abs=1e-6)
-    J = as_stated(problem).whiten(found.x)[1].toarray()[:, movable]
+    J = problem.whiten(found.x)[1].toarray()[:, movable]
     cov = np.zeros((movable.size, movable.size))
     cov[np.ix_(movable, movable)] = np.linalg.inv(J.T @ J)
     own = cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)]

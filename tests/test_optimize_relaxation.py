@@ -21,6 +21,7 @@ from coopoc.optimize.convex import certify, reduced, shor
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
 from coopoc.optimize.convex.reduced import Reduced
 from coopoc.optimize.graph_problems import read_graph
+from coopoc.optimize.model.space import exp
 
 UP = 0.6
 """Vertical against horizontal std in anisotropic problems."""
@@ -45,7 +46,7 @@ def two_robots(seed: int, d: int = 2, fixed: bool = False, noise: float = 1.0, p
     from scipy.spatial.transform import Rotation
 
     rng, steps = np.random.default_rng(seed), 4
-    turn = Rotation.random(2 * steps, rng=rng).as_matrix() if d == 3 else _turns(rng.uniform(-3, 3, 2 * steps))
+    turn = Rotation.random(2 * steps, rng=rng).as_matrix() if d == 3 else exp(rng.uniform(-3, 3, (2 * steps, 1)))
     at = rng.uniform(-5, 5, (2 * steps, d))
     names = tuple(f"{robot}{k}" for robot in "AB" for k in range(steps))
     x = np.concatenate([at, turn.reshape(len(at), -1)], axis=1)
@@ -63,18 +64,13 @@ def two_robots(seed: int, d: int = 2, fixed: bool = False, noise: float = 1.0, p
     return problem.add("range", across, np.abs(ranges)[:, None], 0.1)
 
 
-def _turns(angle: Floats) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-
-
 def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
     """Smallest cost that scipy finds from random starts, over positions or, in the plane, positions and headings."""
     rng, n, d = np.random.default_rng(0), len(problem.names), problem.dimension
 
     def system(y: Floats) -> tuple[Floats, Any]:
         rows = y.reshape(n, -1)
-        return problem.whiten(problem.space.join(rows[:, :d], _turns(rows[:, 2]) if problem.poses else None))
+        return problem.whiten(problem.space.join(rows[:, :d], exp(rows[:, 2:]) if problem.poses else None))
 
     def found() -> float:
         start = rng.uniform(-spread, spread, n * (d + bool(problem.poses)))

@@ -217,7 +217,7 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
             kind = f"{kind}_chordal"
             variance.append(rotation_variance(edges.covariance, d))
         std = np.sqrt(variance).repeat([d, d * d][: len(variance)], axis=0).T
-        factors.append(Factor(kind, edges.nodes, z, std=std))
+        factors.append(Factor(kind, edges.nodes, z, std=std, twice=turns and d == 2))
     ranges, sigma = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
     apart = ranges.distance > 0
     if apart.any():

@@ -399,13 +399,12 @@ def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float
 
 
 def as_stated(problem: Problem) -> Problem:
-    """The problem with the weights of the noise that it states, of the same structure: in the plane
-    kappa |R_j - R_i R_ij|_F^2 with CORA's kappa = 1 / var_theta weighs the angle twice as much."""
-    d = problem.dimension
-    if d == 3 or not any(f.kind in CHORDAL for f in problem.factors):
+    """The problem with the weights of the noise that it states, of the same structure: without those that count
+    rotations twice."""
+    if not any(f.twice for f in problem.factors):
         return problem
-    share = np.sqrt([1.0] * d + [0.5] * d * d)
-    factors = (reweighed(f, share) if f.kind in CHORDAL else f for f in problem.factors)
+    share = np.sqrt([1.0] * problem.dimension + [0.5] * (problem.space.ambient - problem.dimension))
+    factors = (reweighed(f, share) if f.twice else f for f in problem.factors)
     return problem.replace_unchecked(factors=tuple(factors))
 
 
@@ -429,9 +428,8 @@ def implausible(cost: float, mean: float, variance: float) -> bool:
 def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     """Mean and variance of the cost at its minimum under the noise that it assumes.
 
-    Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation
-    matrix count as the angles that they hold; in the plane kappa |R_j - R_i R_ij|_F^2 is twice the square of the
-    angle's error over its variance, and adds 1 and 2.
+    Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation matrix count as the
+    angles that they hold; an angle of the plane that is weighed twice adds 1 and 2.
     """
     d, angles, count, matrices = problem.dimension, problem.space.angles, 0, 0
     for factor in problem.factors:
@@ -439,10 +437,10 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
         if factor.kind in CHORDAL:
             turned = np.count_nonzero(factor.root[:, :, d:].any(axis=1), axis=1)
             measured = measured - np.maximum(turned - angles, 0)
-            matrices += int(np.count_nonzero(turned))
+            matrices += int(np.count_nonzero(turned)) * factor.twice
         count += int(measured.sum())
     spare = count - unknowns
-    turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices and d == 2 else 0
+    turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices else 0
     mean = 0.5 * (max(spare, 0) + max(turns, 0))
     return mean, mean + max(turns, 0)
 

@@ -90,6 +90,7 @@ class Factor:
         sqrt_information: instead of std, (size, size) or (M, size, size), W^T W = cov^-1.
         constants: (M, c) or (c,) numbers of the kind, such as dt s of a speed.
         loss: rho, None for least squares.
+        twice: the rotations weigh twice what their noise says, as by CORA's kappa = 1 / var_theta in the plane.
         cov: instead of std, covariances shaped as sqrt_information.
 
     Raises:
@@ -108,6 +109,7 @@ class Factor:
     sqrt_information: Floats | None = None
     constants: Floats | None = None
     loss: Loss | None = None
+    twice: bool = False
     cov: InitVar[npt.ArrayLike | None] = None
 
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
@@ -228,7 +230,7 @@ def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
     """
     groups = dict[Any, list[Factor]]()
     for factor in factors:
-        groups.setdefault((factor.kind, factor.loss, factor.std is None), []).append(factor)
+        groups.setdefault((factor.kind, factor.loss, factor.twice, factor.std is None), []).append(factor)
     return factors if len(groups) == len(factors) else tuple(map(_joined, groups.values()))
 
 
@@ -311,7 +313,7 @@ def as_factor(constraint: Constraint) -> Factor:
     """The factor whose residual is h of a constraint, angles in [-pi, pi]."""
     made, shape = object.__new__(Factor), constraint.lower.shape
     made.__dict__.update(kind=constraint.kind, nodes=constraint.nodes, constants=constraint.constants)
-    made.__dict__.update(z=np.zeros(shape), std=np.ones((1, shape[1])), sqrt_information=None, loss=None)
+    made.__dict__.update(z=np.zeros(shape), std=np.ones((1, shape[1])), sqrt_information=None, loss=None, twice=False)
     return made
 
 

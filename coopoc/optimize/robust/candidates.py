@@ -96,5 +96,5 @@ def bounds(marked: Marked, threshold: float) -> Floats:
     """(G,) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
     from scipy.special import gammaincinv
 
-    freedom = marked.collected(lambda factor: (factor.root != 0).any(axis=-1).sum(axis=-1))
+    freedom = marked.collected(lambda factor: factor.measured)
     return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
