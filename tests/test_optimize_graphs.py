@@ -19,7 +19,7 @@ import coopoc as co
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
-from coopoc.optimize.assess.assess import SMALL, _seen, as_stated, assess, expected, newton_decrease
+from coopoc.optimize.assess.assess import DENSE_COLUMNS, _seen, as_stated, assess, expected, newton_decrease
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph, read_graph
@@ -184,7 +184,7 @@ def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_ba
     still = ~problem.movable
     theirs = bayes_tree_marginals(as_stated(problem).whiten(x)[1], still, len(problem.names), problem.space.dof)
     theirs[still[:, :, None] | still[:, None, :]] = 0.0
-    assert len(problem.names) > SMALL
+    assert len(problem.names) > DENSE_COLUMNS
     assert found.active is not None
     assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
     assert found.remaining < 1e-6

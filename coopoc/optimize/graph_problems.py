@@ -32,7 +32,7 @@ from .starts.pose_starts import graph_of, placed, places_all
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
-KINDS = {
+MEASUREMENT_KINDS = {
     "relative_pose": "relative_pose",
     "pose_prior": "pose",
     "relative_point": "relative_position",
@@ -203,7 +203,7 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
     d, factors = graph.dimension, list[Factor]()
-    for name, kind in KINDS.items():
+    for name, kind in MEASUREMENT_KINDS.items():
         edges: Any = getattr(graph, name)
         if not len(edges):
             continue

@@ -31,7 +31,7 @@ NEWTON_DECREASE = 1e-8
 """That of a Newton step where Gauss-Newton's step is below the tolerance: 1e-4 standard deviations away."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
-MANY = 1000
+COVARIANCE_NODES = 1000
 """Nodes beyond which covariances are computed only where they are asked for: they take as long as some steps."""
 DEFAULTS = ("gauss-newton", "osqp", "casadi")
 """Backends of a problem for which none is named: the first that can solve it."""
@@ -56,7 +56,7 @@ def solve(
         backend: a name of `backends()`, "folder/mine.py:BACKEND" or a Backend; None: gauss-newton, and where there are
             constraints the first of osqp and casadi that holds them.
         throw: raise unless SOLVED; otherwise failure is data.
-        covariance: whether to compute marginals; None: of up to MANY nodes.
+        covariance: whether to compute marginals; None: of up to COVARIANCE_NODES nodes.
         options: of the backend, such as max_iterations and tolerance (m).
 
     Raises:
@@ -72,7 +72,7 @@ def solve(
     instance("problem", problem, Problem)
     chosen = _chosen(problem) if backend is None else require_backend(backend)
     instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
-    wanted = len(problem.names) <= MANY if covariance is None else instance("covariance", covariance, bool)
+    wanted = len(problem.names) <= COVARIANCE_NODES if covariance is None else instance("covariance", covariance, bool)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if (factors := fused(problem.factors)) is not problem.factors:

@@ -23,7 +23,7 @@ from .robust.loop_closures import AGREEING
 from .solution import Solution, Status
 from .solve import solve
 
-UNLIKELY = 30.0
+UNLIKELY_FACTOR = 30.0
 """Factor by which residuals may differ from what is stated; on real graphs they are 0.2 to 1 times as large."""
 MISTAKEN = (
     "Are its matrices covariances where the format has information, or the reverse, its angles in rad, lengths in m?"
@@ -73,7 +73,7 @@ def solve_file(
     for joint in solution.extras.get("joined", ()):
         if joint["rival"] >= AGREEING:
             say("{body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint))
-    if size is not None and not 1 / UNLIKELY < size < UNLIKELY:
+    if size is not None and not 1 / UNLIKELY_FACTOR < size < UNLIKELY_FACTOR:
         say(f"residuals are {size:.2g} times what the file states. {MISTAKEN}")
     return int(solution.status is not Status.SOLVED)
 

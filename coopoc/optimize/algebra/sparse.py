@@ -19,7 +19,7 @@ from .cholesky import Cholesky, DenseCholesky
 
 LIBRARIES = ("scipy.sparse", "coopoc.kernels.graphs.graph_tape", "coopoc.kernels.graphs.multifrontal")
 """What every solve imports late, so that `import coopoc` stays quick."""
-DENSE = 200
+DENSE_UNKNOWNS = 200
 """Unknowns up to which one dense matrix is as fast."""
 
 
@@ -130,7 +130,7 @@ class Layout:
         if not hasattr(self._local, "cholesky"):
             pattern = self.entries.indptr, self.entries.indices
             group = np.nonzero(self.entries.number >= 0)[0]
-            small = 0 < self.entries.size <= DENSE
+            small = 0 < self.entries.size <= DENSE_UNKNOWNS
             self._local.cholesky = DenseCholesky(*pattern) if small else Cholesky(*pattern, group)
         return self._local.cholesky  # type: ignore[no-any-return]
 
@@ -172,7 +172,7 @@ _LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
 
 def shared_layout(structure: Structure) -> Layout:
     """The layout of a structure, shared by its problems."""
-    if structure.nodes * structure.space.dof <= DENSE:
+    if structure.nodes * structure.space.dof <= DENSE_UNKNOWNS:
         return _small(structure)
     if (layout := _LARGE.get(structure)) is None:
         layout = _LARGE[structure] = Layout(structure)

@@ -10,7 +10,7 @@ from ...arrays import Bools, Floats, Ints
 from ..model.factor import as_factor, bounded, stacked
 from ..model.problem import Problem
 
-NEAR = 5e-7
+ACTIVE_STEP = 5e-7
 """m or rad, a step this long reaches the bound: the constraint is active."""
 DEPENDENT = 1e-9
 """Singular value, of rows of length 1, below which they are dependent."""
@@ -89,7 +89,7 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     """
     rows = constraint_rows(problem, x)
     length = np.sqrt(rows.matrix.power(2).sum(axis=1))
-    reach = NEAR * length
+    reach = ACTIVE_STEP * length
     low, high = rows.value - rows.lower <= reach, rows.upper - rows.value <= reach
     equal, touched = rows.lower == rows.upper, np.flatnonzero((low | high) & (length > 0))
     multipliers, onto = np.zeros(len(length)), np.zeros(gradient.size)

@@ -25,7 +25,7 @@ INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
 CANCELLED = 1e-7
 """Share of its terms that a row may keep along a direction that it does not see."""
-SMALL = 200
+DENSE_COLUMNS = 200
 """Columns up to which the null space of J is that of a dense matrix."""
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
@@ -36,7 +36,7 @@ LEVER = 0.1
 """m or rad, least radius of a way along which no measurement changes."""
 TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
-MANY = 0.25
+DOUBTFUL_SHARE = 0.25
 """Share of measurements whose rejection casts doubt on the minimum."""
 INLIER_WEIGHT = 0.5
 """Weight rho' below which a robust loss rejects a measurement."""
@@ -258,7 +258,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
 
     unit = (J @ diags_array(1.0 / length)).tocsc()
     square = unit.T @ unit
-    if len(length) <= SMALL:
+    if len(length) <= DENSE_COLUMNS:
         values, ways = np.linalg.eigh(square.toarray())
         return ways[:, values <= 1e-10 * values.max(initial=1.0)].T
     shift, factored = 1e-12, None
@@ -388,12 +388,12 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
 
 
 def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float) -> str:
-    """The note on measurements that are rejected, and on what remains; it begins louder from MANY of them on.
+    """The note on measurements that are rejected, and on what remains; it begins louder from DOUBTFUL_SHARE of them on.
 
     >>> rejection("GNC", 4, 9, "candidates", 2.5, 3.0)
     'DOUBTFUL: GNC rejects 4 of 9 candidates; the rest costs 2.5 where the stated noise explains 3'
     """
-    loud = "DOUBTFUL: " if out >= MANY * of else ""
+    loud = "DOUBTFUL: " if out >= DOUBTFUL_SHARE * of else ""
     rest = f"the rest costs {cost:.4g} where the stated noise explains {mean:.3g}"
     return f"{loud}{what} rejects {out} of {of} {which}; {rest}"
 

@@ -15,14 +15,14 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, Solver, SolverResult
 from ..model.derivatives import Structure, expressions
 from ..model.factor import stacked, steerable
 from ..model.problem import Problem
 
-DENSE = 200
+FATROP_NUMBERS = 200
 """Numbers that can move up to which FATROP is faster than IPOPT."""
-ROUNDS = 10
+CHART_MOVES = 10
 """Moves of the chart of the poses, at most."""
 SUCCESS = "Solve_Succeeded"
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
@@ -45,7 +45,7 @@ IPOPT = {
 FATROP: dict[str, Any] = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "acceptable_iter": 3}
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
     """Solver of a structure.
 
     Args:
@@ -70,7 +70,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             f"must be at most the {moving} numbers that can move",
             "Leave out those that follow from the others.",
         )
-    methods = ("fatrop", "ipopt") if moving <= DENSE and np.array_equal(*sides) else ("ipopt",)
+    methods = ("fatrop", "ipopt") if moving <= FATROP_NUMBERS and np.array_equal(*sides) else ("ipopt",)
 
     @lru_cache
     def nlp(method: str) -> NlpSolver:
@@ -97,7 +97,7 @@ def _run(
     """Solve around x (n, ambient), and for poses again around the answer until it stays."""
     space, free, count, rounds = form.space, form.movable, 0, 0
     multipliers: Floats = np.zeros(len(sides[0]))
-    while rounds < ROUNDS:
+    while rounds < CHART_MOVES:
         here = np.zeros(int(free.sum())), _numbers(problem, x)
         at, multipliers, iterations, status = nlp(*here, sides, multipliers)
         before, step, count, rounds = x, np.zeros(free.shape), count + iterations, rounds + 1

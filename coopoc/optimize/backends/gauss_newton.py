@@ -4,12 +4,12 @@ import numpy as np
 
 from ...arrays import Floats
 from ..algebra.sparse import sparse
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Solver, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
     """Solver of a structure.
 
     Args:

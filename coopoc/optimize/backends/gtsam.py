@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Solver, SolverResult
 from ..model.derivatives import linearise
 from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
@@ -27,7 +27,7 @@ PRECISE = 1e-15
 POINT, POSE = False, True
 Names: TypeAlias = Mapping[tuple[bool, ...], str]
 """GTSAM's class by which of the nodes are poses."""
-SAME = 1e-12
+WEIGHT_TOLERANCE = 1e-12
 """Share by which two weights may differ and count as equal."""
 ESTIMATORS = {
     "huber": "Huber",
@@ -38,7 +38,7 @@ ESTIMATORS = {
 """GTSAM's names of our losses; their values and weights are the same."""
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
     """Solver of a structure.
 
     Args:
@@ -179,7 +179,7 @@ def _chord(W: Floats, z: Floats, d: int) -> Form:
         weight[:, (d + 1) * (column % (d + 1)) + np.arange(d)] = own[:, None]
         expected[:, rows, rows] = own[:, None]
     scale = np.sqrt(np.einsum("mii->mi", information))
-    if (np.abs(information - expected) > SAME * scale[:, :, None] * scale[:, None, :]).any():
+    if (np.abs(information - expected) > WEIGHT_TOLERANCE * scale[:, :, None] * scale[:, None, :]).any():
         return None
     root = np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1])
     return [Part({(POSE, POSE): f"FrobeniusBetweenFactorPose{d}"}, _poses(d, z), root)]
@@ -197,7 +197,7 @@ def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
 
 def _coupled(W: Floats, d: int) -> bool:
     """Whether position and rotation are correlated."""
-    return bool(max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max()) > SAME * np.abs(W).max())
+    return bool(max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max()) > WEIGHT_TOLERANCE * np.abs(W).max())
 
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {

@@ -20,7 +20,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, Solver, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
@@ -51,17 +51,17 @@ BOUNDED = {
 """Settings that change under constraints."""
 NEGLIGIBLE = 1e-11
 """m, an error of a coordinate that no tolerance asks to be smaller."""
-CLOSE = 1e-9
+BOUND_TOLERANCE = 1e-9
 """m, by which a bound may be missed."""
 KKT = 1e-9
 """Largest |P dx + q + C^T y| that is accepted, as a share of |q| or of the largest |P_ij dx_j|."""
 REPAIRS = 5
 """Continuations of a quadratic programme before its answer is refused."""
-FAR = 1e-6
+STEP_WEIGHT = 1e-6
 """Cost of a step of 1 m over that of a violation of 1 m, where none can be avoided."""
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
     """Solver of a structure. A linear problem is a single quadratic programme.
 
     Args:
@@ -183,8 +183,10 @@ class Programme:
         weak = KKT * float(np.maximum(np.abs(q), np.abs(own * dx)).max(initial=0.0))
         if not (np.abs(rest + self._rows.T @ y) <= weak + NEGLIGIBLE * own).all():
             return False
-        kept = (value >= lower - CLOSE) & (value <= upper + CLOSE)
-        pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
+        kept = (value >= lower - BOUND_TOLERANCE) & (value <= upper + BOUND_TOLERANCE)
+        pushed = ((y <= weak) | (value >= upper - BOUND_TOLERANCE)) & (
+            (y >= -weak) | (value <= lower + BOUND_TOLERANCE)
+        )
         return bool(np.all(kept & pushed))
 
 
@@ -212,7 +214,7 @@ def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
         step, _ = Programme(diags(weight, format="csc"), matrix).solve(weight, 0.0 * weight, *rows.sides)
     except Infeasible:
         slack, feasible = csc_matrix(hstack([matrix, eye(len(rows.value))])), False
-        weight = np.concatenate([FAR * weight, np.ones(len(rows.value))])
+        weight = np.concatenate([STEP_WEIGHT * weight, np.ones(len(rows.value))])
         step, _ = Programme(diags(weight, format="csc"), slack).solve(weight, 0.0 * weight, *rows.sides)
     return problem.space.retract(x, step[: matrix.shape[1]].reshape(len(x), -1)), feasible
 

@@ -14,9 +14,9 @@ from ...arrays import Bools, Floats
 from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from .qcqp import Multipliers, Quadratic
 
-DENSE = 500
+FORMED_ROWS = 500
 """Up to this many constrained rows C is formed."""
-SMALL = 200
+DENSE_ROWS = 200
 """Up to this many rows of X all matrices are dense."""
 LOOSE = 1e-10
 """Share of the largest singular value below which positions are free."""
@@ -66,7 +66,7 @@ class Reduced:
     def _small(self) -> tuple[Floats, Floats] | None:
         """A, and all rows of X over the constrained ones, by the pseudo-inverse, where a dense matrix is faster."""
         A, bound = self.problem.rows, self.problem.bound
-        if A.shape[1] > SMALL:
+        if A.shape[1] > DENSE_ROWS:
             return None
         A = A.toarray()
         free = np.linalg.pinv(A[:, bound:], rcond=LOOSE) @ A[:, :bound]
@@ -82,7 +82,7 @@ class Reduced:
 
     def times(self, X: Floats) -> Floats:
         """C X."""
-        if self.problem.bound <= DENSE:
+        if self.problem.bound <= FORMED_ROWS:
             return self.matrix @ X
         return np.asarray(self._rows[:, : self.problem.bound].T @ (self._rows @ self._all(X)))
 
@@ -113,7 +113,7 @@ class Reduced:
         from scipy.sparse.linalg import LinearOperator, eigsh
 
         size = self.problem.bound
-        if size <= DENSE:
+        if size <= FORMED_ROWS:
             return np.linalg.eigvalsh(self.matrix - L.matrix.toarray())[:count]
         less, shift, factored, rest = L.matrix, -1e-7 * self.scale, None, self.gram.shape[0] - size
         while factored is None:  # the Schur complement of this matrix is C - less - shift I

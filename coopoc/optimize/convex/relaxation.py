@@ -23,13 +23,13 @@ from ..solve import solve
 from .qcqp import Multipliers, multipliers, quadratic
 from .reduced import Reduced
 
-LARGEST = 60
+MAX_SHOR_ROWS = 60
 """Constrained rows up to which `shor` takes seconds at most."""
 TIGHT = 1e-6
 """Gap of a tight relaxation, as a share of the cost (at least of 1)."""
 SOLVER = {**dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-9), "max_threads": 1}
 """Settings of Clarabel."""
-ALIKE = 1e-2
+SAME_POINT = 1e-2
 """Sum of squares below which two points are one: what is this near, the curvature at a minimum decides."""
 GAP = 1e-6
 """Largest gap of a certified solution, as a share of its cost (at least of 1, the cost of two residuals of one std)."""
@@ -82,7 +82,7 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
         refine: follow by `solve` from the rounded point.
 
     Raises:
-        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: CVXPY.
+        InputError: as `quadratic`, or more than MAX_SHOR_ROWS constrained rows. MissingLibraryError: CVXPY.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> relaxed = shor(problem.add("range", ("a", "b"), 6.0, std=1.0))
@@ -91,9 +91,9 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
     """
     began = time.perf_counter()
     form = quadratic(problem)
-    if form.bound > LARGEST:
+    if form.bound > MAX_SHOR_ROWS:
         hint = "Solve it, and ask certify(problem, solution), which takes any number."
-        raise InputError("problem", f"{form.bound} constrained rows", f"must have at most {LARGEST}", hint)
+        raise InputError("problem", f"{form.bound} constrained rows", f"must have at most {MAX_SHOR_ROWS}", hint)
     reduced = Reduced(form)
     block, sphere, Z = semidefinite(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
     bound = reduced.lower_bound(Multipliers(form, block, sphere))[0]
@@ -204,7 +204,7 @@ def certify(problem: Problem, solution: Solution) -> Certificate:
     gap, smallest = solution.cost - bound, float(values[0])
     certified = gap <= GAP * max(solution.cost, 1.0)
     framed = form.stiefel.size and len(values) > form.columns
-    alone = certified and bool(framed and 2.0 * max(gap, 0.0) < ALIKE * values[-1])
+    alone = certified and bool(framed and 2.0 * max(gap, 0.0) < SAME_POINT * values[-1])
     unique = alone and not solution.unobservable
     image = "a motion of all, costs" if alone else "a mirror image, may cost"
     other = "no other point costs as little" if unique else f"another, such as {image} as little"

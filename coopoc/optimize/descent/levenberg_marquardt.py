@@ -32,20 +32,20 @@ AGAINST = 2
 GROWTH, DECAY = 10.0, 5.0
 """Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
 middle where a step overshoots."""
-FIRST = 1e-8
+FIRST_DAMPING = 1e-8
 """Damping once some is needed, relative to the diagonal: the smooth modes of a chain of thousands of poses, which need
 it first, have that share of a pose's information."""
-ROUNDED = 1e-18
+ROUNDED_SHARE = 1e-18
 """Predicted decrease, as a share of the cost or of 1, that ends the loop: some 1e-8 standard deviations to go, before
 the step that is taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
-SLOW = 0.2
+SLOW_RATIO = 0.2
 """A predicted decrease above this share of the one before is evidence against J^T J, too: it converges slowly."""
-NEAR = 1e-3
+HESSIAN_SHARE = 1e-3
 """Share of the cost from which on the exact Hessian makes the last steps."""
-STILL = 12
-"""Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
+HIDDEN_STEPS = 12
+"""In a row, that end the loop: damping has fallen from FIRST_DAMPING to none, or the matrix is singular without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +79,8 @@ def arrive(
     the geometry.
 
     H = J^T J, until two gain ratios were off by more than a fifth, or two predicted decreases hardly fell, or the end
-    is NEAR; then the exact Hessian, with which the last steps converge quadratically however large the residuals are.
-    Where that is not positive definite J^T J takes over for some steps. mu is the multiplier of a trust region
+    is near, by HESSIAN_SHARE; then the exact Hessian, with which the last steps converge quadratically however large
+    the residuals are. Where that is not positive definite J^T J takes over for some steps. mu is the multiplier of a trust region
     |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps are
     `bounded`, J^T J stays, and the last step is one below the tolerance. A `smooth` descent ends with the first step
     whose gain ratio is not within 1/2 .. 3/2. An undamped step that raises the cost is taken with the next one where
@@ -122,7 +122,7 @@ def arrive(
             dx, push = taken
             predicted = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx + push)
             there = system.retract(x, dx)
-            near = predicted <= NEAR * cost and against >= 0 and not bounded
+            near = predicted <= HESSIAN_SHARE * cost and against >= 0 and not bounded
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
             after = trial[0]
@@ -131,7 +131,9 @@ def arrive(
             gain = 1.0 if hidden else (cost - after) / abs(predicted)
             still = still + 1 if hidden else 0
             record.append((cost, mu, gain))
-            converged = (hidden and small) or (not bounded and (predicted <= ROUNDED * max(cost, 1.0) or still > STILL))
+            converged = (hidden and small) or (
+                not bounded and (predicted <= ROUNDED_SHARE * max(cost, 1.0) or still > HIDDEN_STEPS)
+            )
             if not gain > 0.0:
                 corrected = None if mu or smooth or bounded or model == "newton" else _corrected(system, there)
                 kept = -np.inf if corrected is None else (cost - system.cost(corrected)) / predicted
@@ -149,7 +151,7 @@ def arrive(
             if smooth and abs(gain - 1.0) >= NONQUADRATIC:
                 break
             if not bounded and model == "gauss-newton":
-                off = abs(gain - 1.0) > MISMATCH or (record[-1][1] == 0.0 and predicted > SLOW * last)
+                off = abs(gain - 1.0) > MISMATCH or (record[-1][1] == 0.0 and predicted > SLOW_RATIO * last)
                 against = against + 1 if against < 0 or off else max(against - 1, 0)
                 against = AGAINST if near else against
                 model = "newton" if against >= AGAINST else model
@@ -167,7 +169,7 @@ def _corrected(system: Sparse, x: Floats) -> Floats | None:
 
 
 def _grown(mu: float) -> float:
-    return GROWTH * mu if mu > 0.0 else FIRST
+    return GROWTH * mu if mu > 0.0 else FIRST_DAMPING
 
 
 def _next(mu: float, gain: float) -> float:

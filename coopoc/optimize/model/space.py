@@ -133,7 +133,7 @@ def cross(w: Floats) -> Floats:
     return matrix
 
 
-FARTHEST = 1e6
+MAX_ANGLE = 1e6
 """rad, beyond which the sine of an angle keeps too few digits to be one of a heading."""
 
 
@@ -144,7 +144,7 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     array([ 1.,  2.,  0., -1.,  1.,  0.])
     """
     at, w = checked("position", position), checked("turn", turn)
-    refuse("turn", w, ~(np.abs(w) <= FARTHEST), "must be finite, at most 10^6 rad", "Give rad.")
+    refuse("turn", w, ~(np.abs(w) <= MAX_ANGLE), "must be finite, at most 10^6 rad", "Give rad.")
     jump = np.abs(np.diff(w, axis=0, prepend=0.0) if w.ndim else w) > TWO_TURNS  # a drive's may be unwrapped
     hint = "Convert degrees by np.deg2rad, and wrap what is unwrapped."
     refuse("turn", w, jump, "must be in rad, and jump by less than two turns", hint)

@@ -9,7 +9,7 @@ import numpy as np
 from ...arrays import Floats, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
-from ..backend import MAX_ITERATIONS, TOLERANCE
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
@@ -17,15 +17,15 @@ from ..starts.mirrors import Cost, Descend, across, movable
 from ..starts.race import drawn
 from .candidates import Inner, Marked, mark
 
-ROUNDS = 300
+MAX_ROUNDS = 300
 """About 20 are needed."""
-RATE = 1.4
+MU_RATE = 1.4
 """By which mu changes from round to round."""
 SETTLED = 1e-6
 """Largest change of a weight that is none."""
 EASY = 1e-6
 """Below this mu is not inverted: all candidates are far within their thresholds."""
-AGAIN = 17.0
+REGRADUATE_RATIO2 = 17.0
 """Squared ratio of a residual to its threshold from which the end graduates once more: it may then give up other
 measurements, as good as those that it rejects."""
 GAINED = 1e-3
@@ -55,14 +55,14 @@ SURROGATES = {
     "truncated": Surrogate(
         lambda worst: 1.0 / max(2.0 * worst - 1.0, EASY),
         lambda s, mu: np.clip(np.sqrt(mu * (mu + 1.0) / np.maximum(s, 1e-30)) - mu, 0.0, 1.0),
-        lambda mu: mu * RATE,
+        lambda mu: mu * MU_RATE,
         lambda new, old, mu: bool(((new == old) & ((new == 0.0) | (new == 1.0))).all()),
         1e6,
     ),
     "geman-mcclure": Surrogate(
         lambda worst: max(2.0 * worst, 1.0),
         lambda s, mu: np.square(mu / (s + mu)),
-        lambda mu: max(mu / RATE, 1.0),
+        lambda mu: max(mu / MU_RATE, 1.0),
         lambda new, old, mu: mu == 1.0 and bool((np.abs(new - old) <= SETTLED).all()),
         1.0,
     ),
@@ -100,13 +100,13 @@ def graduate(
     """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), mu and weight (G,),
     default ones."""
     weight = np.ones(len(marked.bound)) if weight is None else weight
-    for rounds in range(ROUNDS):
+    for rounds in range(MAX_ROUNDS):
         new = surrogate.weight(marked.squares(x) / marked.bound, mu)
         settled, weight = surrogate.done(new, weight, mu), new
         if settled:
             return Graduation(x, weight, rounds, mu, True)
         x, mu = inner(marked.reweigh(weight, x)), surrogate.later(mu)
-    return Graduation(x, weight, ROUNDS, mu, False)
+    return Graduation(x, weight, MAX_ROUNDS, mu, False)
 
 
 def contest(
@@ -160,7 +160,7 @@ def contest(
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)
             if len(loose):
-                again = graduate(marked, surrogate, inner, best_x, surrogate.first(AGAIN))
+                again = graduate(marked, surrogate, inner, best_x, surrogate.first(REGRADUATE_RATIO2))
                 best_x = min((best_x, landed(again.x)), key=cost)
             best_x, moves, *_ = across(
                 truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
@@ -207,7 +207,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
 
     def inner(part: Problem) -> Floats:
         nonlocal steps
-        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
+        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, STEP_TOLERANCE)
         steps += end.iterations
         return end.x
 

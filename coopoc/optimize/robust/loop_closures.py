@@ -18,7 +18,7 @@ from ..starts.initial import initial_guess
 from ..starts.pose_starts import along_poses
 from .candidates import Inner, Marked
 
-ROUNDS = 100
+JOIN_ROUNDS = 100
 """About 15 are needed: half of those that fit join in each."""
 MAX_JOINS = 2
 """Times that a candidate may join: one that a wrong neighbour has displaced returns once that is gone."""
@@ -26,9 +26,9 @@ NONLINEAR_FACTOR = 10.0
 """Times its bound up to which a d^2 is checked by a solve: predictions along a drive are linear, its arc is not."""
 MAX_RESOLVES = 10
 """Solves of these at most, the least certain predictions first."""
-STEPS = 20
+RESOLVE_STEPS = 20
 """Of such a solve; a loop that fits needs fewer."""
-TOLERANCE = 1e-3
+RESOLVE_TOLERANCE = 1e-3
 """m or rad, a step that ends it."""
 HYPOTHESES = 20
 """Placements of a pair of bodies, spread over its candidates, and as many of those that contradict the best: where
@@ -37,7 +37,7 @@ AGREEING = 2
 """Candidates that must agree, the placement's own included: one alone proves nothing."""
 WORLD_BODY = -1
 """The body that known inliers join to the world: to fixed nodes, or to nodes with measurements of their own."""
-HINT = 'Name fewer measurements as candidates, or use start="all".'
+HINT = 'Name fewer measurements as candidates, or use start="any".'
 
 
 def known_start(marked: Marked, inner: Inner) -> "Decided":
@@ -143,7 +143,7 @@ class Decided:
         judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
         sparse(marked.problem)  # is kept as long as the problem is, so that all rounds share its analysis
         most_joins, rounds = 1, 0
-        while rounds < ROUNDS:
+        while rounds < JOIN_ROUNDS:
             self.x, rounds = inner(marked.reweigh(weight, self.x)), rounds + 1
             leaving = judged & (weight > 0) & (marked.squares(self.x) > bound)
             left[leaving], weight[leaving] = left[leaving] + 1, 0.0
@@ -170,7 +170,7 @@ class Decided:
         for joins in (0.0, 1.0):
             self.weight[group] = joins
             system = sparse(marked.reweigh(self.weight, self.x))
-            costs.append(system.cost(arrive(system, self.x, STEPS, TOLERANCE).x if joins else self.x))
+            costs.append(system.cost(arrive(system, self.x, RESOLVE_STEPS, RESOLVE_TOLERANCE).x if joins else self.x))
         good = 2.0 * (costs[1] - costs[0]) <= self.bound[group]
         self.weight[group] = float(good)
         return bool(good)

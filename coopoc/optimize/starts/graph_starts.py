@@ -30,17 +30,17 @@ SWEEPS = 5
 """Of rotation averaging in space; in the plane the first is exact."""
 WOUND = 2.0
 """rad by which the errors along a cycle may sum; with another turn they would sum to twice as much and more."""
-WHOLE = 1.5
+WHOLE_GROWTH = 1.5
 """Growth after which a stage moves all nodes; the others move what is new and was so one stage before, and points."""
-STEPS = 5
+STAGE_STEPS = 5
 """Of each stage."""
-TOLERANCE = 1e-2
+STAGE_TOLERANCE = 1e-2
 """m or rad, a step at which a stage has arrived for the purpose."""
-DESCENT = 60
+TRILATERATION_STEPS = 60
 """Steps of a trilateration, of which ten are usual."""
 PLACED = 1e-6
 """Share of the longest range: a shorter step is its last."""
-FIRST, LEAST = 1e-3, 1e-9
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
 """Damping at first, beside directions of length 1, and at least."""
 HOLDING = 2
 """Ranges per dimension from which a point is placed by them."""
@@ -131,14 +131,14 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
     normal = np.linalg.eigh(p.T @ p)[1][:, 0]
     flat = guess - normal * (guess @ normal)
     height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
-    at, damping = np.array([guess, flat + height * normal, flat - height * normal]), np.full((3, 1, 1), FIRST)
+    at, damping = np.array([guess, flat + height * normal, flat - height * normal]), np.full((3, 1, 1), FIRST_DAMPING)
     now = _squares(p, ranges, at)
-    for _ in range(DESCENT):
+    for _ in range(TRILATERATION_STEPS):
         step = -np.linalg.solve(now[:, :d, :d] + damping * np.eye(d), now[:, :d, d:])[..., 0]
         there = _squares(p, ranges, at + step)
         better = there[:, d, d] < now[:, d, d]
         at[better], now[better] = at[better] + step[better], there[better]
-        damping = np.where(better[:, None, None], np.maximum(damping / GROWTH, LEAST), GROWTH * damping)
+        damping = np.where(better[:, None, None], np.maximum(damping / GROWTH, MIN_DAMPING), GROWTH * damping)
         if np.abs(step).max() <= PLACED * ranges.max():
             break
     return np.asarray(at[np.argmin(now[:, d, d])] + middle)
@@ -149,7 +149,7 @@ def _squares(places: Floats, ranges: Floats, at: Floats) -> Floats:
     the ranges, so that the last number is the cost."""
     gap = at[:, None] - places
     distance = np.linalg.norm(gap, axis=2, keepdims=True)
-    rows = np.concatenate([gap / np.maximum(distance, LEAST), distance - ranges[:, None]], axis=2)
+    rows = np.concatenate([gap / np.maximum(distance, MIN_DAMPING), distance - ranges[:, None]], axis=2)
     return np.asarray(rows.swapaxes(1, 2) @ rows)
 
 
@@ -182,7 +182,7 @@ def tree(graph: Graph) -> Floats:
         for _ in range(SWEEPS):
             step = turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))
             rotation = exp(step) @ rotation
-            if np.abs(step).max(initial=0.0) <= TOLERANCE:
+            if np.abs(step).max(initial=0.0) <= STAGE_TOLERANCE:
                 break
         moved = _averaging(edges.nodes, position_variance(edges.covariance, d), still, len(rotation))
         position += moved(position[j] - position[i] - np.einsum("mab,mb->ma", rotation[i], edges.position))
@@ -321,7 +321,7 @@ def _ranged(graph: Graph, point: int, placed: Bools) -> tuple[Ints, Floats]:
 def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     """Nodes (n, ambient) and iterations: each stage solves the measurements among the poses so far.
 
-    Most stages move what is new alone, so that the whole costs a few steps of the last one (WHOLE).
+    Most stages move what is new alone, so that the whole costs a few steps of the last one (WHOLE_GROWTH).
     A stage begins at the answer of the one before, which it continues by the relative poses of the problem's x0, so
     that odometry drifts little. Points join when they are seen or have a prior, as x0 has them, or where enough ranges
     place them, and anew whenever these have doubled: few may have placed them on the wrong side.
@@ -353,10 +353,10 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
         before, solved = solved, used | joins
         free = solved & (~before | last | ~graph.is_pose)
         last = solved & ~before
-        if stage == count - 1 or solved.sum() >= WHOLE * whole:
+        if stage == count - 1 or solved.sum() >= WHOLE_GROWTH * whole:
             free, whole = solved, int(solved.sum())
         part, kept = _among(problem, solved, free, x)
-        end = arrive(sparse(part), np.array(part.x0), STEPS, TOLERANCE)
+        end = arrive(sparse(part), np.array(part.x0), STAGE_STEPS, STAGE_TOLERANCE)
         x[kept], iterations = end.x, iterations + end.iterations
     return x, iterations
 

@@ -17,20 +17,20 @@ RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
 LEVEL = "bearing", "azimuth"
 """Kinds whose measurements of a node in space fit its mirror image at a level plane as well."""
-LARGEST = 2000
+PATH_NODES = 2000
 """Nodes up to which all shortest paths are taken."""
 SUBSETS = 60
 """Of the ranges of a point, whose spheres are cut."""
-TRIED = 32
+MAX_DESCENTS = 32
 """Moves that are followed by descents, of few bodies and the most promising first."""
-NEAR, TRY = 10.0, 100.0
+DOUBTED_COST, TRIED_COST = 10.0, 100.0
 """Cost, and as many times the cost of its ranges, that a move may add before the others have given way, to be a doubt
 and to be tried."""
-ROUNDS = 15
+MOVE_ROUNDS = 15
 """Of moves, of which three are usual."""
-SAME = 1e-6
+MIN_SAVING = 1e-6
 """Share of the cost that a move must save."""
-BELIEVED, MAJORITY = 4.0, 0.55
+BELIEVED_STDS, MAJORITY = 4.0, 0.55
 """Standard deviations within which a range fits a place, and the share of them that must, so that a point stays."""
 MOST_RANGED = 6
 """Points with most ranges to others that are tried for the next one that is placed."""
@@ -113,7 +113,7 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     ranges, (n, d) = ranges_of(problem, x), x.shape
     moved = [f for f in problem.factors if f.kind == "displacement"]
     loose = stacked(bodies(problem, x))
-    if n > LARGEST or not len(loose) or not len(ranges.nodes):
+    if n > PATH_NODES or not len(loose) or not len(ranges.nodes):
         return x
     table = np.full((n, n), np.inf)
     np.minimum.at(table, tuple(ranges.nodes.T), np.maximum(ranges.distance, 0.0))
@@ -199,7 +199,7 @@ def _all_mirrored(ranges: Ranges, loose: list[Ints]) -> Iterator[Floats]:
         y[body] = _mirrored(problem, x[body], plane)
     gap = problem.space.position(y)[ranges.nodes]
     cost = ranges.cost(np.linalg.norm(gap[:, 0] - gap[:, 1], axis=1)[:, None], np.arange(len(gap)))
-    if float(cost[0]) <= TRY * (1.0 + len(gap) / len(x)) * len(loose):
+    if float(cost[0]) <= TRIED_COST * (1.0 + len(gap) / len(x)) * len(loose):
         yield y
 
 
@@ -245,9 +245,9 @@ def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
                 y[body] = moves[0][1]
         yield y
     yield from _all_mirrored(ranges, [*{int(body[0]): body for *_, body in single}.values()])
-    near = [move for move in single if move[0] <= TRY * (1.0 + len(ranges.nodes) / len(x))][:TRIED]
+    near = [move for move in single if move[0] <= TRIED_COST * (1.0 + len(ranges.nodes) / len(x))][:MAX_DESCENTS]
     together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
-    for chosen in islice(together, TRIED):
+    for chosen in islice(together, MAX_DESCENTS):
         y = x.copy()
         for _, there, body in chosen:
             y[body] = there
@@ -270,19 +270,19 @@ def across(problem: Problem, x: Floats, descend: Descend, cost: Cost) -> tuple[F
     if len(loose) == len(problem.names) or not len(ranges.nodes):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
     rivals, single = list[float](), list[Move]()
-    while count < ROUNDS:
+    while count < MOVE_ROUNDS:
         ranges = ranges_of(problem, x)
         single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
         rivals = []
         for start in _moves(ranges, single):
             end = descend(start)
-            if (now := cost(end)) < (1.0 - SAME) * least - 1e-9:
+            if (now := cost(end)) < (1.0 - MIN_SAVING) * least - 1e-9:
                 x, least, count = end, now, count + 1
                 break
             rivals.append(now)
         else:
             break
-    doubtful = {int(body[0]): body for adds, _, body in single if adds <= NEAR}
+    doubtful = {int(body[0]): body for adds, _, body in single if adds <= DOUBTED_COST}
     if problem.dimension == 3 and any(f.kind in LEVEL for f in problem.factors):
         moved = {int(body[0]) for *_, body in single}
         doubtful |= {int(body[0]): body for body in every if body[0] not in moved}
@@ -322,13 +322,13 @@ def regrown(problem: Problem, x: Floats) -> Floats:
         """Whether ranges (K,) to others and fixes (F,) fit places (C, d): (C, K), (C, F)."""
         length = np.linalg.norm(at[:, None] - places[others], axis=2)
         off = np.einsum("fab,cfb->cfa", root[own], at[:, None] - fix[own])
-        fits = np.abs(length - ranges.distance[rows]) * ranges.weight[rows] <= BELIEVED
-        return fits, np.linalg.norm(off, axis=2) <= BELIEVED
+        fits = np.abs(length - ranges.distance[rows]) * ranges.weight[rows] <= BELIEVED_STDS
+        return fits, np.linalg.norm(off, axis=2) <= BELIEVED_STDS
 
     kept, loose = np.ones(n, dtype=bool), movable(problem)
     length = np.linalg.norm(places[ranges.nodes[:, 0]] - places[ranges.nodes[:, 1]], axis=1)
-    fits = np.abs(length - ranges.distance) * ranges.weight <= BELIEVED
-    near = np.linalg.norm(np.einsum("fab,fb->fa", root, places[fixed] - fix), axis=1) <= BELIEVED
+    fits = np.abs(length - ranges.distance) * ranges.weight <= BELIEVED_STDS
+    near = np.linalg.norm(np.einsum("fab,fb->fa", root, places[fixed] - fix), axis=1) <= BELIEVED_STDS
     while True:
         both = kept[ranges.nodes].all(axis=1)
         of, good = (

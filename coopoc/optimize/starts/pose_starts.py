@@ -28,13 +28,13 @@ FIELDS = {
 """Kinds of a graph's edges, by the kind of a factor without what follows its name."""
 UNKNOWN = 1e-9
 """1/m^2 or 1/rad^2, of a component that is not measured."""
-ROWS = 300
+ROWS_USED = 300
 """Fixes and ranges of a body that are used, spread over all."""
-FEW, MANY = 10, 100
+FIRST_STEPS, LAST_STEPS = 10, 100
 """Steps from each turn of a body, and from the best of these."""
-LARGEST = 1e100
+MAX_STD = 1e100
 """Standard deviations, whose square is a number."""
-APART = 0.1
+PLACES_APART = 0.1
 """Share of the size of a body by which places of it differ."""
 PLACING = {*FIELDS, "bearing", "displacement", CONVERTED}
 """Kinds by which a start places nodes; where there are others, nodes are drawn, too."""
@@ -185,9 +185,9 @@ def _fitted(
     from scipy.spatial.transform import Rotation
 
     d = space.dimension
-    seen, fix, precise = (part[:: len(part) // ROWS + 1] for part in fixes)
-    near, places, distance, weight = (part[:: len(part) // ROWS + 1] for part in ranges)
-    poses, marks, angle, sure = (part[:: len(part) // ROWS + 1] for part in bearings)
+    seen, fix, precise = (part[:: len(part) // ROWS_USED + 1] for part in fixes)
+    near, places, distance, weight = (part[:: len(part) // ROWS_USED + 1] for part in ranges)
+    poses, marks, angle, sure = (part[:: len(part) // ROWS_USED + 1] for part in bearings)
     middle, to = space.position(body).mean(axis=0), np.concatenate([fix, places, marks]).mean(axis=0)
 
     def moved(v: Floats, turn: Floats, at: Floats) -> Floats:
@@ -200,19 +200,19 @@ def _fitted(
         east, north = np.einsum("mab,ma->bm", exp(v[d:]) @ turn @ space.rotation(poses), gap)[:2]
         aside = wrap(np.arctan2(north, east) - angle)
         every = np.concatenate([off.ravel(), (length - distance) * weight, aside * sure])
-        return np.asarray(np.clip(np.nan_to_num(every), -LARGEST, LARGEST))
+        return np.asarray(np.clip(np.nan_to_num(every), -MAX_STD, MAX_STD))
 
     def fitted(v: Floats, turn: Floats, steps: int) -> tuple[float, Floats, Floats]:
         end = least_squares(residuals, v, args=(turn,), max_nfev=steps)
         return float(end.cost), end.x, turn
 
     turns = exp(np.arange(8)[:, None] * np.pi / 4) if d == 2 else Rotation.create_group("O").as_matrix()
-    ends = sorted((fitted(np.zeros(space.dof), each, FEW) for each in turns), key=lambda end: end[0])
+    ends = sorted((fitted(np.zeros(space.dof), each, FIRST_STEPS) for each in turns), key=lambda end: end[0])
     best, apart = list[Floats](), np.linalg.norm(space.position(body) - middle, axis=1).max()
     for _, v, turn in ends:
-        _, v, turn = fitted(v, turn, MANY)
+        _, v, turn = fitted(v, turn, LAST_STEPS)
         there = space.join(moved(v, turn, space.position(body)), exp(v[d:]) @ turn @ space.rotation(body))
-        if all(np.abs(space.position(there - other)).max() > APART * apart for other in best):
+        if all(np.abs(space.position(there - other)).max() > PLACES_APART * apart for other in best):
             best.append(there)
         if len(best) > rank:
             break

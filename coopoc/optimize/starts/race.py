@@ -15,27 +15,27 @@ from ..model.space import exp
 from .graph_starts import parts
 from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
 
-STEPS = 12
+FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
-ROUNDS = ((3.0, 25), (1.25, 200))
+LATER_STEPS = ((3.0, 25), (1.25, 200))
 """Those whose cost is within the first number of the least go on by as many steps as the second says, of several with
 the same cost the cheapest alone."""
-SAME = 1e-3
+SAME_COST = 1e-3
 """Share by which costs may differ and count as the same minimum: the cheaper start then stays."""
-TOLERANCE = 1e-3
+RACE_TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
-EXCESS = 5.0
+EXCESS_STDS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
-MORE = 50
+JUDGED_STEPS = 50
 """Steps before it is judged."""
-RIVAL = 10.0
+RIVAL_COST = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
-DRAWS, QUIET, POINTS, HIGH = 90, 30, 1800, 2.0
+DRAWS, QUIET_DRAWS, DRAWN_POINTS, HIGH_STDS = 90, 30, 1800, 2.0
 """Random starts at most, if the first lead to no other minimum of about the cost and this is no more than so many
 standard deviations above its mean, and as many points together."""
-ALIKE, ROUNDED = 1e-5, 1e-9
+SAME_MINIMUM, ROUNDED_COST = 1e-5, 1e-9
 """Share by which the costs of two random starts that led to the same minimum differ, and cost that is rounding."""
-ENOUGH, APART, PART = 6, 0.05, 0.8
+AGREEING_DRAWS, RIVAL_DISTANCE, PATH_SHARE = 6, 0.05, 0.8
 """Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
 elsewhere, and that of the ranges whose shortest paths make a start."""
 BARRIER = 0.1
@@ -55,9 +55,9 @@ def race(
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
-    All starts are tried, and those whose costs are near the least go on (ROUNDS). One start ends the race at once: its
-    descent is `smooth`, its cost is within its chi-square bound, and either its end is `unwound` or a second start led
-    there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to the
+    All starts are tried, and those whose costs are near the least go on (LATER_STEPS). One start ends the race at once:
+    its descent is `smooth`, its cost is within its chi-square bound, and either its end is `unwound` or a second start
+    led there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to the
     same end, the late starts are tried, one after the other. Where it was smooth, the stated noise is taken to be too
     small, and a note of the Solution reports it. At last random starts around the end are tried, and what ranges alone
     place is mirrored.
@@ -73,18 +73,18 @@ def race(
     system, taken, arrived = sparse(problem), 0, True
     tried, calm, straight, minima = dict[str, tuple[float, Floats]](), list[float](), set[str](), list[float]()
     mean, variance = expected(problem, system.size)
-    usual = EXCESS * np.sqrt(variance)
+    usual = EXCESS_STDS * np.sqrt(variance)
     limit = mean + usual
 
-    def descend(x: Floats, steps: int = MORE) -> Floats:
+    def descend(x: Floats, steps: int = JUDGED_STEPS) -> Floats:
         nonlocal taken, arrived
-        end = arrive(system, x, steps, TOLERANCE)
+        end = arrive(system, x, steps, RACE_TOLERANCE)
         taken, arrived = taken + end.iterations, end.converged
         return end.x
 
     def attempt(name: str, x: Floats, steps: int, smooth: bool = False) -> Arrival:
         nonlocal taken
-        end = arrive(system, x, steps, TOLERANCE, smooth=smooth)
+        end = arrive(system, x, steps, RACE_TOLERANCE, smooth=smooth)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         return end
 
@@ -92,26 +92,26 @@ def race(
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        x = x if draws is False else descend(x, ROUNDS[-1][1])
+        x = x if draws is False else descend(x, LATER_STEPS[-1][1])
         ends, least = list[tuple[float, Floats]](), system.cost(x)
         drawing = least > limit if draws is None else draws
-        most = QUIET if least <= mean + HIGH * np.sqrt(variance) else DRAWS
+        most = QUIET_DRAWS if least <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
         for k, away in enumerate(_away(problem, x) if drawing else ()):
             if k >= most:
                 break
-            y = descend(away, ROUNDS[-1][1])
+            y = descend(away, LATER_STEPS[-1][1])
             cost = system.cost(y)
-            if arrived and cost < least + RIVAL:
+            if arrived and cost < least + RIVAL_COST:
                 ends.append((cost, y))
                 most = DRAWS if higher(cost, least) or higher(least, cost) else most
                 if higher(least, cost):
                     name, x, least = "drawn", y, cost
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
-        near = [each for each in (*rivals, *minima) if higher(each, cost, SAME) and each < cost + RIVAL]
-        near += [each for each, _ in ends if higher(each, cost) and each < cost + RIVAL]
+        near = [each for each in (*rivals, *minima) if higher(each, cost, SAME_COST) and each < cost + RIVAL_COST]
+        near += [each for each, _ in ends if higher(each, cost) and each < cost + RIVAL_COST]
         notes = (rival(min(near) - cost),) if near else ()
-        alike = [y for c, y in ends if not higher(c, cost) and np.abs(y - x).max() > SAME * np.abs(x).max()]
+        alike = [y for c, y in ends if not higher(c, cost) and np.abs(y - x).max() > SAME_COST * np.abs(x).max()]
         if any(system.cost(0.5 * (x + y)) > cost + BARRIER for y in alike):
             notes = *notes, ELSEWHERE
         elif doubtful and not near:
@@ -121,27 +121,27 @@ def race(
 
     late, rough = dict(late), list[str]()
     for name, start in starts.items():
-        end, cost = attempt(name, start(), STEPS, True), tried[name][0]
+        end, cost = attempt(name, start(), FIRST_STEPS, True), tried[name][0]
         if not smooth(end):
             rough.append(name)
         else:
             calm.append(cost)
-            alike = sum(abs(cost - other) <= SAME * cost for other in calm) > 1
-            if (cost <= limit and alike) or (cost <= ROUNDS[0][0] * limit and unwound(end.x)):
-                return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME * cost))
+            alike = sum(abs(cost - other) <= SAME_COST * cost for other in calm) > 1
+            if (cost <= limit and alike) or (cost <= LATER_STEPS[0][0] * limit and unwound(end.x)):
+                return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost))
             straight |= {name} if end.converged else set()
-    if grown in late and not straight and min(cost for cost, _ in tried.values()) > ROUNDS[0][0] * limit:
+    if grown in late and not straight and min(cost for cost, _ in tried.values()) > LATER_STEPS[0][0] * limit:
         y, steps = late.pop(grown)(problem)
         y, taken = descend(y), taken + steps
         tried[grown] = system.cost(y), y
         if explained(y):
             return ended(grown, y)
     for name in rough:
-        attempt(name, tried[name][1], STEPS)
+        attempt(name, tried[name][1], FIRST_STEPS)
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
-    for within, steps in ROUNDS:
-        if all(cost <= (1.0 + SAME) * least for cost, _ in tried.values()):
+    for within, steps in LATER_STEPS:
+        if all(cost <= (1.0 + SAME_COST) * least for cost, _ in tried.values()):
             break
         tried = _distinct(tried)
         close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
@@ -151,8 +151,8 @@ def race(
             reached |= {name: cost for name, (cost, _) in tried.items()}
             minima = [cost for (cost, _), end in zip(tried.values(), ends, strict=True) if end.converged]
             least = min(reached.values())
-    name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    if name not in straight and not explained(x) and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1:
+    name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME_COST) * least)
+    if name not in straight and not explained(x) and sum(c <= (1.0 + SAME_COST) * least for c in reached.values()) == 1:
         x = descend(x)
         for other, made in late.items():
             if explained(x):
@@ -161,9 +161,9 @@ def race(
             taken += steps
             y = descend(y)
             costs = system.cost(x), system.cost(y)
-            if max(costs) <= ROUNDS[0][0] * min(costs):
+            if max(costs) <= LATER_STEPS[0][0] * min(costs):
                 x, y = descend(x), descend(y)
-            name, x = (other, y) if system.cost(y) < (1.0 - SAME) * system.cost(x) else (name, x)
+            name, x = (other, y) if system.cost(y) < (1.0 - SAME_COST) * system.cost(x) else (name, x)
     return ended(name, x)
 
 
@@ -178,7 +178,7 @@ def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
     free[list(problem.fixed)] = 0.0
     around = x - x.mean(axis=0)
     spread, (*_, thin) = np.sqrt(d * np.square(around).mean()), np.linalg.svd(around, full_matrices=False)[2]
-    for k in range(min(DRAWS, POINTS // n)):
+    for k in range(min(DRAWS, DRAWN_POINTS // n)):
         away = spread * rng.normal(size=(n, d)) * free
         if k % 4 == 1:
             away[np.arange(n) != rng.integers(n)] = 0.0
@@ -197,7 +197,7 @@ def _turned(problem: Problem, x: Floats) -> Iterator[Floats]:
     part = parts(n, *(f.nodes[f.informative] for f in problem.factors if f.kind.startswith(("relative", "body"))))
     held = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
     free = np.setdiff1d(part, part[np.concatenate([np.array(problem.fixed, np.int64), *held])])
-    for k in range(min(DRAWS, POINTS // n) if len(free) else 0):
+    for k in range(min(DRAWS, DRAWN_POINTS // n) if len(free) else 0):
         y = x.copy()
         for body in free if k % 4 < 2 else rng.choice(free, 1):
             own = np.flatnonzero(part == body)
@@ -219,7 +219,7 @@ def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
 
         def descend(y: Floats, system: Sparse = system) -> Floats:
             nonlocal taken
-            end = arrive(system, y, STEPS, TOLERANCE)
+            end = arrive(system, y, FIRST_STEPS, RACE_TOLERANCE)
             taken += end.iterations
             return end.x
 
@@ -231,7 +231,7 @@ def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, 
     """Those whose cost differs from that of every one before, which is cheaper."""
     distinct: dict[str, tuple[float, Floats]] = {}
     for name, (cost, x) in tried.items():
-        if all(abs(cost - other) > SAME * min(cost, other) for other, _ in distinct.values()):
+        if all(abs(cost - other) > SAME_COST * min(cost, other) for other, _ in distinct.values()):
             distinct[name] = cost, x
     return distinct
 
@@ -248,7 +248,7 @@ def drawn(problem: Problem, x: Floats, loose: Ints, descend: Descend, cost: Cost
     that leads lower; and what makes it doubtful: no other start leads there, or some lead elsewhere for about the same
     cost.
     """
-    ends, most, d = list[tuple[float, Floats]](), min(POINTS // len(x), QUIET), problem.dimension
+    ends, most, d = list[tuple[float, Floats]](), min(DRAWN_POINTS // len(x), QUIET_DRAWS), problem.dimension
     best, least, agree = x, np.nan_to_num(cost(x), nan=np.inf), 0
     for y in _places(problem, x, loose) if len(loose) else ():
         y = descend(y) if ends else x
@@ -258,19 +258,19 @@ def drawn(problem: Problem, x: Floats, loose: Ints, descend: Descend, cost: Cost
         ends.append((now, y))
         best, least = (y, now) if higher(least, now) else (best, least)
         agree = sum(not higher(each, least) for each, _ in ends)
-        if agree == ENOUGH or len(ends) > most:
+        if agree == AGREEING_DRAWS or len(ends) > most:
             break
-    size = APART * np.ptp(np.concatenate([y[:, :d] for _, y in ends] or [x]), axis=0).max()
-    near = [each - least for each, y in ends if each < least + RIVAL and np.abs(y - best)[:, :d].max() > size]
+    size = RIVAL_DISTANCE * np.ptp(np.concatenate([y[:, :d] for _, y in ends] or [x]), axis=0).max()
+    near = [each - least for each, y in ends if each < least + RIVAL_COST and np.abs(y - best)[:, :d].max() > size]
     notes = (rival(min(near)) if higher(least + min(near), least) else ELSEWHERE,) if near else ()
     if agree == 1 < len(ends):
         notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
     return best, notes
 
 
-def higher(cost: float, least: float, share: float = ALIKE) -> bool:
+def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
     """Whether a cost is above another by more than that share, and than rounding makes of exact data."""
-    return cost > (1.0 + share) * least + ROUNDED
+    return cost > (1.0 + share) * least + ROUNDED_COST
 
 
 def rival(more: float) -> str:
@@ -293,7 +293,7 @@ def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
             y[f.nodes[here, 0], :d] = f.z[here] + noise[..., 0]
         if k % 2 and not problem.space.has_rotation:
             part = (
-                taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PART)) if f.kind == "range" else f
+                taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PATH_SHARE)) if f.kind == "range" else f
                 for f in problem.factors
             )
             by_paths = scaled(problem.replace_unchecked(factors=tuple(part)), x)
