@@ -57,10 +57,10 @@ def race(
 
     All starts are tried, and those whose costs are near the least go on (LATER_STEPS). One start ends the race at once:
     its descent is `smooth`, its cost is within its chi-square bound, and either its end is `unwound` or a second start
-    led there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to the
-    same end, the late starts are tried, one after the other. Where it was smooth, the stated noise is taken to be too
-    small, and a note of the Solution reports it. At last random starts around the end are tried, and what ranges alone
-    place is mirrored.
+    led there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to
+    the same end, the late starts are tried, one after the other. Where it was smooth, the stated noise is taken to be
+    too small, and a note of the Solution reports it. At last random starts around the end are tried, and what ranges
+    alone place is mirrored.
 
     Args:
         problem: at any start.
