@@ -116,15 +116,17 @@ def bridging_note(recording: Recording) -> tuple[str, ...]:
     driving = np.isfinite(recording.velocity)
     share = 100 * (np.isnan(recording.gnss) & driving).sum() / driving.sum()
     note = f"{share:.0f} % of the fixes are missing: the last one is brought forward with the velocity"
-    return (note,) if share else ()
+    return () if recording.complete else (note,)
 
 
 def bridged(recording: Recording, known: NoiseModel) -> tuple[Floats, Floats]:
     """All fixes (R, T, N, 3) m and their variances m^2, broadcastable to them; a missing one is the last one moved by
     odometry, z_t = z_{t-1} + dt u_t, whose variance has grown by the process noise."""
     x, variance = recording.gnss, np.ascontiguousarray(known.fix_variance(recording))
-    process, missing = np.broadcast_to(known.process_variance(recording), x.shape), np.isnan(x)
+    if recording.complete:
+        return x, variance
     x, variance = x.copy(), np.broadcast_to(variance, x.shape).copy()
+    process, missing = np.broadcast_to(known.process_variance(recording), x.shape), np.isnan(x)
     for t in range(1, x.shape[1]):
         gap, moved = missing[:, t], recording.dt * recording.velocity[:, t]
         x[:, t] = np.where(gap, x[:, t - 1] + moved, x[:, t])

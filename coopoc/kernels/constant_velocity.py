@@ -51,7 +51,8 @@ def constant_velocity(
     velocity, growth, spread, proved = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count)
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
     p, score = np.zeros((models, 3)), np.zeros((models, 3))
-    v = np.zeros(3)
+    v, best = np.zeros(3), FIRST
+    score[:, 0], score[:, 1] = PRIOR, PRIOR * variance
     for j in range(count):
         dt = t[j] - t[j - 1] if j > 0 else math.inf
         if dt > gap:
@@ -59,10 +60,6 @@ def constant_velocity(
                 p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, speed * speed / variance
                 for c in range(3):
                     x[m, c], u[m, c] = fixes[j, c], 0.0
-            if j == 0:
-                best = FIRST
-                for m in range(models):
-                    score[m, 0], score[m, 1], score[m, 2] = PRIOR, PRIOR * variance, 0.0
             growth[j] = math.nan
             continue
         keep, most = math.exp(-dt / REMEMBERS), -math.inf
@@ -75,16 +72,17 @@ def constant_velocity(
                 x[m, c] += dt * u[m, c]
                 v[c] = fixes[j, c] - x[m, c]
                 square += v[c] * v[c]
-            limit = 3.0 * BEYOND**2 * max(score[m, 1] / score[m, 0], TINY) * s
+            numbers, squares, logs = score[m]
+            limit = 3.0 * BEYOND**2 * max(squares / numbers, TINY) * s
             clip = math.sqrt(limit / square) if square > limit else 1.0
             for c in range(3):
                 x[m, c] += clip * a / s * v[c]
                 u[m, c] += clip * b / s * v[c]
             p[m, 0], p[m, 1], p[m, 2] = a / s, b / s, d - b * b / s
-            score[m, 0] = keep * score[m, 0] + 3.0
-            score[m, 1] = keep * score[m, 1] + min(square, limit) / s
-            score[m, 2] = keep * score[m, 2] + 3.0 * math.log(s)
-            likely = -0.5 * (score[m, 0] * math.log(max(score[m, 1] / score[m, 0], TINY)) + score[m, 2])
+            numbers, squares = keep * numbers + 3.0, keep * squares + min(square, limit) / s
+            logs = keep * logs + 3.0 * math.log(s)
+            score[m, 0], score[m, 1], score[m, 2] = numbers, squares, logs
+            likely = -0.5 * (numbers * math.log(max(squares / numbers, TINY)) + logs)
             if likely > most:
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):

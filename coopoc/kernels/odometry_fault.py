@@ -134,24 +134,24 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / LATE, 0.0), speed2)
     q = state[BASE] + interval**2 * max(state[RATIO] * speed2, state[FLOOR] ** 2)
     q *= UNKNOWN * time / interval
-    pb, bb = state[VARIANCE + 1], state[VARIANCE + 2]
-    state[VARIANCE] += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
-    state[VARIANCE + 1], state[VARIANCE + 2] = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
-    state[SURE] = max(state[SURE] + q, r * time / WANDERS)
-    s, sure = state[VARIANCE] + r, state[SURE] + r
+    p, pb, bb = state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2]
+    p += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
+    pb, bb = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
+    sure = max(state[SURE] + q, r * time / WANDERS)
+    s, wide = p + r, sure + r
     square = believed = 0.0
     for c in range(2):
         gap, moved = state[GAPS + c] / state[COUNT], state[WAY + c] + time * state[ERROR + c]
         state[GAPS + c] = gap - state[ERROR + c] * state[TIMES] / state[COUNT]
         square += state[GAPS + c] ** 2 / s
         gap += state[PLACE + c] - state[BELIEVED + c]
-        believed += gap**2 / sure
+        believed += gap**2 / wide
         state[PLACE + c] += moved
         state[BEFORE + c] += state[WAY + c]
         state[BELIEVED + c] += state[WAY + c]
         state[WAY + c] = gap  # until the update below
-    anew, gain = square > FAR, state[VARIANCE + 1] / s
-    share, trust = 1.0 if anew else state[VARIANCE] / s, 1.0 if believed > FAR else state[SURE] / sure
+    anew, gain = square > FAR, pb / s
+    share, trust = 1.0 if anew else p / s, 1.0 if believed > FAR else sure / wide
     for c in range(2):
         gap = state[GAPS + c]
         state[PLACE + c] += share * gap
@@ -159,17 +159,13 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
         state[ERROR + c] += 0.0 if anew else gain * gap
         state[BELIEVED + c] += trust * state[WAY + c]
         state[GAPS + c] = state[WAY + c] = 0.0
-    if anew:
-        state[VARIANCE], state[VARIANCE + 1] = r, 0.0
-        state[VARIANCE + 2] = max(state[VARIANCE + 2], state[SPEED])
-    else:
-        state[VARIANCE + 2] -= gain * state[VARIANCE + 1]
-        state[VARIANCE], state[VARIANCE + 1] = share * r, (1.0 - share) * state[VARIANCE + 1]
+    bb = max(bb, state[SPEED]) if anew else bb - gain * pb
+    state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2] = share * r, (1.0 - share) * pb, bb
     state[SURE] = trust * r
     state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, COUNTS) - 1.0)), 1.0)
     state[LASTS] += time
     state[PATH] += time * math.sqrt(speed2)
-    more = 0.5 * (min(believed, COUNTS) - min(square, COUNTS)) + math.log(sure / s)
+    more = 0.5 * (min(believed, COUNTS) - min(square, COUNTS)) + math.log(wide / s)
     too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > RATE**2
     state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MOST)
     if state[EVIDENCE] == 0.0:
@@ -197,7 +193,8 @@ def correct_drives(
         variance: (N, 3) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
-        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2.
+        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
+            length only to ask.
     """
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)
     fails = False
@@ -217,6 +214,7 @@ def correct_drives(
                 r = 0.5 * (variance[n, 0] + variance[n, 1])
                 extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
-                out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
-                out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
+                if len(out):
+                    out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
+                    out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
     return fails

@@ -170,7 +170,8 @@ def solo_filter(
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     columns = np.asarray(columns)
     shape = *gnss.shape[:2], len(columns), 3
-    first, scale = int(x0 is not None), np.ones((1, 1))
+    first = int(x0 is not None)
+    scale: Floats = np.ones((1, 1))
     if isinstance(noise, MotionNoise):
         process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
     else:

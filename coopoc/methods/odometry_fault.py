@@ -29,10 +29,13 @@ def with_odometry(
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
-    fresh, found = new_state(motion_noise(noise_model, recording.dt)), np.zeros(velocity.shape)
+    fresh = new_state(motion_noise(noise_model, recording.dt))
     variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)
-    if not correct_drives(gnss, velocity, fresh, variance, columns, recording.dt, found):
+    given = gnss, velocity, fresh, variance, columns, recording.dt
+    if not correct_drives(*given, np.empty((0, 0, 0, 3))):
         return recording, noise_model
+    found = np.zeros(velocity.shape)
+    correct_drives(*given, found)
     velocity, extra = velocity.copy(), found[..., 2]
     velocity[..., :2] += found[..., :2]
     notes = [*noise_model.notes]

@@ -234,6 +234,11 @@ class Recording:
         """(R, L, 3) `relative` without azimuths of what is straight above or below, as estimators take it."""
         return drop_steep_azimuths(self.relative)
 
+    @cached_property
+    def complete(self) -> bool:
+        """Whether every vehicle has a fix wherever it is."""
+        return bool((np.isfinite(self.gnss) | np.isnan(self.velocity)).all())
+
     def neighbours(self, ego: int | str) -> Ints:
         """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
         (column,) = columns("ego", [ego], self.ids)

@@ -59,7 +59,9 @@ from .cooperative_state import (
     Filter,
     Model,
     begin,
+    copy,
     copy_filter,
+    copy_rows,
     is_placed,
     measured_whole,
     new_filter,
@@ -115,7 +117,6 @@ from .otherwise import (
     average,
     chance,
     clock_of,
-    copy_rows,
     corrected,
     corrected_motion,
     ego_variance,
@@ -246,12 +247,12 @@ def step(
     f.ego[NOW] = f.ego[CORRECTED] = 0.0
     if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
         copy_filter(f, tries.alone)
-    for i in range(OWN):
-        tries.first[i] = own[i]
+    copy(own, tries.first)
     remember_speed(f, own)
     if slips:
         copy_filter(f, other)
-        copy_rows(own, rows, tries, count)
+        copy(own, tries.own)
+        copy_rows(rows, tries.rows)
     attempt(f, model, own, rows, vehicles, count)
     fails = tries.doubts[PENDING] > 0.0
     if slips and surprised(f, fails or known):

@@ -9,16 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, Ints
+from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
-from ..compiling.vectors import LANES, put, take
 from ..gate import FIX_GATE, NOTHING, PATIENCE
 from .gaussian import (
     ABSENT,
     COMMON,
     COMPASS,
     ERROR,
-    KINDS,
     PLACE,
     RANGED,
     TURN,
@@ -180,21 +178,27 @@ def copy_filter(source: Filter, target: Filter) -> None:
         target.g.x[i] = source.g.x[i]
         for j in range(n):
             target.g.p[i, j] = source.g.p[i, j]
-    for i in range(len(source.g.vectors)):
-        target.g.vectors[i] = source.g.vectors[i]
-    for i in range(EGO):
-        target.ego[i] = source.ego[i]
-    for k in range(len(source.who)):
-        for i in range(WHO):
-            target.who[k, i] = source.who[k, i]
-        for i in range(MEMBER):
-            target.member[k, i] = source.member[k, i]
-        for i in range(KINDS):
-            target.g.block[k, i] = source.g.block[k, i]
-    for j in range(len(source.slot)):
-        target.slot[j] = source.slot[j]
-    for i in range(len(source.slot) * STATUS // LANES):
-        put(target.status, i, take(source.status, i))
+    copy(source.g.vectors, target.g.vectors)
+    copy(source.ego, target.ego)
+    copy(source.slot, target.slot)
+    copy_rows(source.who, target.who)
+    copy_rows(source.member, target.member)
+    copy_rows(source.g.block, target.g.block)
+    copy_rows(source.status, target.status)
+
+
+@part
+def copy(source: AnyArray, target: AnyArray) -> None:
+    """Copy numbers to the first ones of another array."""
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@part
+def copy_rows(source: AnyArray, target: AnyArray) -> None:
+    """Copy rows to the first ones of another array."""
+    for k in range(len(source)):
+        copy(source[k], target[k])
 
 
 @part

@@ -301,16 +301,6 @@ def new_tries(slots: int, vehicles: int) -> Tries:
 
 
 @part
-def copy_rows(own: Floats, rows: Floats, tries: Tries, count: int) -> None:
-    """Copy a step's numbers, which trying it changes."""
-    for i in range(OWN):
-        tries.own[i] = own[i]
-    for i in range(count):
-        for j in range(WIDTH):
-            tries.rows[i, j] = rows[i, j]
-
-
-@part
 def gap_to_fix(f: Filter, own: Floats) -> float:
     """Squared normalised distance of the answer from the fix, clipped."""
     square = 0.0

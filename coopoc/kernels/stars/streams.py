@@ -35,11 +35,12 @@ from .cooperative_state import (
     Filter,
     Model,
     begin,
+    copy,
     copy_filter,
     is_placed,
     new_filter,
 )
-from .otherwise import DOUBTS, Tries, measured_motion, new_tries
+from .otherwise import Tries, measured_motion, new_tries
 
 
 @compiled
@@ -156,5 +157,4 @@ def restore(source: Filter, tries: Tries, target: Filter, targets: Tries) -> Non
     """Copy a state, and that of the ego alone."""
     copy_filter(source, target)
     copy_filter(tries.alone, targets.alone)
-    for i in range(DOUBTS):
-        targets.doubts[i] = tries.doubts[i]
+    copy(tries.doubts, targets.doubts)
