@@ -11,7 +11,7 @@ import pytest
 from conftest import textbook, winding
 from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
-from test_star_filters import CHANNELS, gappy, holed, partial
+from test_star_filters import CHANNELS, gappy, holed, partial, slow_fixes
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
@@ -184,6 +184,26 @@ def test_a_wrong_start_is_left_soon_after_it(most, std, off):
     track = CooperativeFilter()(replace(seen, gnss=gnss), [24])
     late = np.linalg.norm(track.x[:, 200:, 0] - fleet.position[200:, 24], axis=-1)
     assert late.max() < 2.0 + std
+
+
+@pytest.mark.parametrize("step", [1, 10])
+@pytest.mark.parametrize(("most", "wrong"), [(0, [0]), (1, [0]), (1, [0, 1]), (3, [0]), (1, [1]), (0, [2]), (3, [4])])
+def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
+    """Law: a start is one number, which others outvote; one wrong fix after a right start harms nothing. Beside one
+    neighbour whose ranges are measured the ego stayed off for good, by as much as its first fix was."""
+    whole = load_fleet("town10").between(0, 400)
+    fleet = Fleet(whole.ids, whole.t[::step], whole.position[::step], whole.velocity[::step])
+    sensors = replace(S2, gnss_std=(1.0,) * 3)
+    seen = slow_fixes(observe(fleet, sensors, V2X(most), runs=2, seed=3, observers=[24]), 10 // step)
+    relative, late = seen.relative.copy(), 10 // step * (2 * len(wrong) if wrong[0] == 0 else 0)
+    relative[..., 1:] = np.nan
+    for off in (30.0, 600.0):
+        gnss = seen.gnss.copy()
+        gnss[:, 10 // step * np.array(wrong), 24] += [0.8 * off, -0.6 * off, 0.0]
+        for m in (Kalman(), JointFilter(), CooperativeFilter()):
+            for sees in (seen.relative, relative):
+                x = m(replace(seen, gnss=gnss, relative=sees), [24]).x[:, late:, 0]
+                assert np.linalg.norm(x - fleet.position[late:, 24], axis=-1).max() < 8.0
 
 
 @pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])

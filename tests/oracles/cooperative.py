@@ -14,7 +14,7 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
+from coopoc.kernels.gate import AWAY, CONFIRMED, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
 from coopoc.kernels.odometry_fault import DECISIVE
 from coopoc.kernels.stars.cooperative_members import CHANGES, CONTRADICTED, WIDEST
 from coopoc.kernels.stars.cooperative_messages import (
@@ -222,7 +222,7 @@ class Oracle:
         numbers += ["score", "numbers", "squares", "late", "weight"]
         levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
         levels |= {name: np.zeros(3) for name in ("gap", "cov", "course", "recent")} | dict.fromkeys(numbers, 0.0)
-        levels |= {"products": [], "louder": {}, "left": None, "jumped": False}
+        levels |= {"products": [], "louder": {}, "left": None, "jumped": False, "votes": [], "spread": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -443,11 +443,14 @@ class Oracle:
         fix = self.seen.gnss[self.run, t, self.ego].copy()
         if s.get("unused") == t:
             fix[:] = np.nan
-        again = bool(g.fix_gate and t > s["began"] and np.isfinite(fix).all() and self.lost(t))
-        again = again and self.start(t, fix, messages, relative)
+        seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix, messages, relative)
+        if outvoted:
+            s["trusted"].add(self.ego)
+        again = bool(g.fix_gate) and t > s["began"] and seen
+        again = again and (outvoted or self.lost(t)) and self.start(t, fix, messages, relative)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
-                if j in others and j not in s["trusted"]:
+                if j in others and (outvoted or j not in s["trusted"]):
                     self.doubt(j)
                 for kind in "xbor":
                     b.drop((kind, j))
@@ -657,14 +660,38 @@ class Oracle:
             s["vague"].discard(self.ego)
         return True
 
+    def outvoted(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
+        """Do more fixes agree with one another elsewhere than with the start, and no more neighbours with that?"""
+        votes, r, (u, q) = self.state["votes"], self.r[t, self.ego] * self.white, self.motion(t)
+        if votes and votes[0][1] >= CONFIRMED:
+            return False
+        for at in votes:
+            at[0] += self.seen.dt * u
+        self.state["spread"] = self.state["spread"] + q.mean() if votes else 0.0
+        if np.isnan(fix).any():
+            return False
+        for at in votes:
+            if ((fix - at[0]) ** 2 / (2 * r + self.state["spread"] + SLIP)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
+                at[1] += 1
+                break
+        else:
+            votes[1:] = [[fix.copy(), 1]]
+        if votes[-1][1] <= votes[0][1]:
+            return False
+        votes[:], self.state["spread"] = [[fix.copy(), votes[1][1]], votes[0]], 0.0
+        b, r = self.state["belief"], self.r[t, self.ego] * self.white
+        x, places = b.at(("x", self.ego)), self.places(t, np.full(3, np.nan), messages, relative)
+        here = [((at - b.x[x] - self.seen.dt * u) ** 2 / (p + r + np.diag(b.p[x, x]))).sum() for at, p in places]
+        there = [((at - fix) ** 2 / (p + r)).sum() for at, p in places]
+        return bool(np.sum(np.array(here) <= FIX_GATE) <= np.sum(np.array(there) <= FIX_GATE))
+
     def lost(self, t: int) -> bool:
         s = self.state
         held = [j for j in s["members"] if j in s["last"]]
         if any(j in s["trusted"] for j in held):
             return False
         if self.ego in s["trusted"]:
-            hits, again = s["hits"]["fix"], s["locked"].get(self.ego, 0.0) >= PATIENCE
-            return bool((hits >= 2 and t - s["joined"][self.ego] - hits <= 1) or (hits > 0 and again))
+            return bool(s["hits"]["fix"] > 0 and s["locked"].get(self.ego, 0.0) >= PATIENCE)
         b, noise = s["belief"], (self.r[t, self.ego] @ self.white) / 3
         error = b.x[b.at(("b", self.ego))]
         apart = [float(np.square(error - b.x[b.at(("b", j))]).sum()) for j in held]
