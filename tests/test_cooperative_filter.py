@@ -34,6 +34,11 @@ def drive(steps: int = 80) -> Fleet:
     return load_fleet("town10-validation").between(0, steps)
 
 
+def every(fleet: Fleet, step: int) -> Fleet:
+    """A drive in longer steps."""
+    return Fleet(fleet.ids, fleet.t[::step], fleet.position[::step], fleet.velocity[::step])
+
+
 @pytest.mark.parametrize("change", [lambda r: r, holed], ids=["whole", "holed"])
 def test_with_everything_off_it_is_the_joint_filter(change):
     """Neighbours are there from the start, messages of now, and fixes so fine that it does not matter where rows are
@@ -158,8 +163,7 @@ def test_wheels_that_slip_leave_the_way_as_it_is(most, factor):
 def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step):
     """Law: fixes of half a metre that jump by 24 m are rejected, teach no level of motion and, once they would be used
     again, cost the receiver its trust: a neighbour knows better."""
-    whole = load_fleet("town10").between(0, 500)
-    fleet = Fleet(whole.ids, whole.t[::step], whole.position[::step], whole.velocity[::step])
+    fleet = every(load_fleet("town10").between(0, 500), step)
     sensors, steps = replace(S2, gnss_std=(0.5, 0.5, 0.5)), len(fleet.t)
     for ego in (0, 12):
         seen = observe(fleet, sensors, V2X(4), runs=2, seed=5, observers=[ego])
@@ -191,9 +195,7 @@ def test_a_wrong_start_is_left_soon_after_it(most, std, off):
 def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
     """Law: a start is one number, which others outvote; one wrong fix after a right start harms nothing. Beside one
     neighbour whose ranges are measured the ego stayed off for good, by as much as its first fix was."""
-    whole = load_fleet("town10").between(0, 400)
-    fleet = Fleet(whole.ids, whole.t[::step], whole.position[::step], whole.velocity[::step])
-    sensors = replace(S2, gnss_std=(1.0,) * 3)
+    fleet, sensors = every(load_fleet("town10").between(0, 400), step), replace(S2, gnss_std=(1.0,) * 3)
     seen = slow_fixes(observe(fleet, sensors, V2X(most), runs=2, seed=3, observers=[24]), 10 // step)
     relative, late = seen.relative.copy(), 10 // step * (2 * len(wrong) if wrong[0] == 0 else 0)
     relative[..., 1:] = np.nan
@@ -222,6 +224,21 @@ def test_fixes_that_were_wrong_are_forgotten_soon_after(priors, most, start, end
         late = int(10 * (end + 10))
         error, usual = (np.linalg.norm(x[:, late:, 0] - fleet.position[late:, 24], axis=-1) for x in (ours, alone))
         assert error.mean() < (0.5 if most else 1.7 * usual.mean())
+
+
+@pytest.mark.parametrize("step", [1, 5])
+@pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
+def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
+    """Law: fixes that are led 60 m away, and are right again, are believed soon after: where they and odometry agree
+    is remembered beside a neighbour whose range does not contradict it, too. It took them for wrong for good."""
+    fleet = every(load_fleet("town10").between(0, 700), step)
+    sensors, late = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02), 500 // step
+    seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=6, observers=[24]), 10 // step)
+    gnss, relative, t = seen.gnss.copy(), seen.relative.copy(), fleet.t - fleet.t[0]
+    gnss[:, :, 24, 0] += np.where((t >= 20) & (t < 40), 3.0 * (t - 20), 0.0)
+    relative[..., 1:] = np.nan
+    x = CooperativeFilter(priors=priors)(replace(seen, gnss=gnss, relative=relative), [24]).x[:, late:, 0]
+    assert np.linalg.norm(x - fleet.position[late:, 24], axis=-1).mean() < 1.8
 
 
 def test_a_position_of_a_minute_is_kept():

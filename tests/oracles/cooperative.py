@@ -450,11 +450,7 @@ class Oracle:
         again = again and (outvoted or self.lost(t)) and self.start(t, fix, messages, relative)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
-                if j in others and (outvoted or j not in s["trusted"]):
-                    self.doubt(j)
-                for kind in "xbor":
-                    b.drop((kind, j))
-                s["members"].remove(j)
+                self.dismiss(j, j in others, outvoted)
         dt = self.seen.dt
         s["agreed"] += dt * (s["hits"].get("fix", 0) == 0)
         s["unseen"] += dt
@@ -468,12 +464,16 @@ class Oracle:
         s["made"] = s["made"] + q.sum()
         if s["left"]:
             grown = 0.0 if self.ego in s["vague"] else self.own_variance() - s["whole"]
-            s["left"] = s["left"][0], s["left"][1] + max(grown, q.sum()) / 3
+            grown, way = max(grown, q.sum()), 0.0
+            if slip:
+                corrections = louder * self.grown if self.corrected_now else 0.0
+                grown, way = max(q.sum() - 3 * corrections, 0.0), self.by[t] * dt if self.corrected_now else 0.0
+            s["left"] = s["left"][0] - way, s["left"][1] + grown / 3
         s["whole"] = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
         if np.isfinite(fix).all():
-            self.add_fix(t, fix)
+            self.add_fix(t, fix, messages, relative)
         at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
         for j in sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego]))):
             new = j in s["vague"] and messages[j] is not None
@@ -495,7 +495,14 @@ class Oracle:
         s["learned"] = np.zeros(6)
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
-    def add_fix(self, t: int, fix: Floats) -> None:
+    def dismiss(self, j: int, measured: bool, doubted: bool) -> None:
+        if measured and (doubted or j not in self.state["trusted"]):
+            self.doubt(j)
+        for kind in "xbor":
+            self.state["belief"].drop((kind, j))
+        self.state["members"].remove(j)
+
+    def add_fix(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> None:
         s, louder = self.state, math.exp(self.state["level"][3])
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
@@ -506,17 +513,17 @@ class Oracle:
             if more > most or far < 2 * math.sqrt(r.sum()):
                 s["jumped"] = more > most
             s["shown"], s["gap"], s["unseen"] = max(s["shown"] + min(more, most), 0.0), gap, 0.0
-        alone = not any(j in s["last"] for j in s["members"])
-        if self.priors.fix_gate and self.ego not in s["vague"] and alone:
-            self.go_back(fix, rows)
+        if self.priors.fix_gate and self.ego not in s["vague"]:
+            self.go_back(t, fix, rows, messages, relative)
+            rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
         s["share"] = share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
 
-    def go_back(self, fix: Floats, rows: list[Any]) -> None:
+    def go_back(self, t: int, fix: Floats, rows: list[Any], messages: Any, relative: dict[int, Floats]) -> None:
         """To where the ego was before fixes contradicted it, if it is there again."""
         s, b = self.state, self.state["belief"]
-        q, _, cov, r = self.mahalanobis(b, rows)
+        q, gap, cov, r = self.mahalanobis(b, rows)
         gate, at = max(self.priors.fix_gate, FIX_GATE), b.at(("x", self.ego))
         s["agree"] = 0.0 if q > gate else s["agree"] + float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
         if not s["left"]:
@@ -529,8 +536,18 @@ class Oracle:
             p += s["driven"] ** 2 * np.diag(b.p)[b.at(("o", self.ego))].sum() / 3
         other = ((fix - x) ** 2 / (p + r + SLIP)).sum()
         s["evidence"] = 0.0 if other > gate else max(s["evidence"] + min(q, most) - other, 0.0)
-        near = np.square(b.x[at] - x).sum() < 3 * p
+        near = np.square(b.x[at] - x + np.diag(cov) / (np.diag(cov) + r) * gap).sum() < 3 * p
         if not near and s["evidence"] > EVIDENCE * most:
+            if self.speak_for(t, b.x[at], x, messages, relative) > 0:
+                return
+            for j in list(s["members"]):
+                self.dismiss(j, j in messages, False)
+            b.drop(("b", self.ego))
+            if self.life.own:
+                b.add(("b", self.ego), 0, self.life.own)
+            s["trusted"].add(self.ego)
+            s["mean"].pop(self.ego, None)
+            at = b.at(("x", self.ego))
             b.transform(("x", self.ego), {})
             b.x[at] = x
             b.noise(("x", self.ego), p)
@@ -679,11 +696,25 @@ class Oracle:
         if votes[-1][1] <= votes[0][1]:
             return False
         votes[:], self.state["spread"] = [[fix.copy(), votes[1][1]], votes[0]], 0.0
-        b, r = self.state["belief"], self.r[t, self.ego] * self.white
-        x, places = b.at(("x", self.ego)), self.places(t, np.full(3, np.nan), messages, relative)
-        here = [((at - b.x[x] - self.seen.dt * u) ** 2 / (p + r + np.diag(b.p[x, x]))).sum() for at, p in places]
-        there = [((at - fix) ** 2 / (p + r)).sum() for at, p in places]
-        return bool(np.sum(np.array(here) <= FIX_GATE) <= np.sum(np.array(there) <= FIX_GATE))
+        b = self.state["belief"]
+        return self.speak_for(t, b.x[b.at(("x", self.ego))] + self.seen.dt * u, fix, messages, relative) <= 0
+
+    def speak_for(self, t: int, here: Floats, there: Floats, messages: Any, relative: dict[int, Floats]) -> int:
+        """How many more neighbours put the ego at one place than at another?"""
+        std, more = self.std * np.exp(self.state["level"][:3] / 2), 0
+        for j, message in messages.items():
+            if message is None or np.isnan(relative[j][0]):
+                continue
+            with np.errstate(divide="ignore"):
+                r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
+            at = message.mean + (t - message.step) * self.seen.dt * message.velocity
+            for place, sign in ((here, 1), (there, -1)):
+                gap = at - place
+                q = (np.linalg.norm(gap) - relative[j][0]) ** 2 / r
+                if np.isfinite(relative[j]).all():
+                    q = np.square(gap - to_vector(relative[j])).sum() / (r + std[1] ** 2 * gap @ gap)
+                more += sign * bool(q <= FIX_GATE)
+        return more
 
     def lost(self, t: int) -> bool:
         s = self.state

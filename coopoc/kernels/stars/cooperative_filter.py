@@ -14,7 +14,7 @@ from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP, remember
 from ..geometry import angle
-from .cooperative_members import join, leave, predict, replace_implausible_velocity
+from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
@@ -65,11 +65,14 @@ from .cooperative_state import (
     is_placed,
     measured_whole,
     new_filter,
+    set_trust,
+    speak_for,
 )
 from .gaussian import (
     COMPASS,
     COV,
     CURVE,
+    GAP,
     LIMIT,
     MEASURED,
     PLACE,
@@ -330,7 +333,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     for k in range(len(f.who)):
         for c in range(4):
             f.member[k, OUT + c] = math.nan
-    add_fix(f, model, own)
+    add_fix(f, model, own, rows, count)
     members = locate(f)
     for i in range(members):
         k = f.who[i, ORDER]
@@ -380,7 +383,7 @@ def gap2(f: Filter, k: int) -> float:
 
 
 @inside
-def add_fix(f: Filter, model: Model, own: Floats) -> None:
+def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share."""
     level = math.exp(f.ego[LEVEL + FIXES])
     if math.isnan(own[FIX]):
@@ -392,7 +395,8 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, FIXES)
         show(f)
-        if model.fix_gate > 0.0 and not heard(f, False) and goes_back(f, model, own, q):
+        if model.fix_gate > 0.0 and goes_back(f, model, own, rows, count, q):
+            fix_terms(f, 0)
             q = innovate(f.g, f.h)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
@@ -400,8 +404,9 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
 
 
 @inside
-def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
-    """Whether an ego alone is where it was before fixes contradicted it (`gate.remember`): then it goes back."""
+def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q: float) -> bool:
+    """Whether an ego is where it was before fixes contradicted it (`gate.remember`), and no neighbours say otherwise:
+    then it goes back, and they join anew."""
     g, h, left = f.g, f.h, f.ego[LEFT:]
     other, apart, gain, spread = 0.0, 0.0, 0.0, left[3]
     if has(g, 0, TURN) and model.absent[0] == -math.inf:  # an error that is surely there errs farther and farther
@@ -410,7 +415,8 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
     for c in range(3):
         p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
         other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP)
-        apart, gain = apart + (g.x[c] - left[c]) ** 2, gain + p / (3.0 * (p + r))
+        gain += p / (3.0 * (p + r))
+        apart += (g.x[c] - left[c] + p / (p + r) * h.three[GAP + c]) ** 2  # where this fix would put it
     gate = max(model.fix_gate, FIX_GATE)
     what, left[4], left[5] = remember(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])
     if what == BEGIN:
@@ -418,7 +424,13 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
             left[c] = g.x[c]
         left[3], left[6] = ego_variance(f) / 3.0, 0.0
         return False
+    if what == BACK and speak_for(f, model, own, rows, count, vector_at(g.x, 0), vector_at(left, 0)) > 0.0:
+        return False
     if what == BACK:
+        for k in range(1, len(f.who)):
+            if f.who[k, VEHICLE] >= 0:
+                dismiss(f, model, k, False)
+        set_trust(f, f.who[0, VEHICLE], 1.0, model.own)
         clear(g, 0)
         for c in range(3):
             g.x[c] = left[c]

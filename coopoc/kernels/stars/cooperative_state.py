@@ -11,8 +11,8 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
-from ..compiling.small import load, store
-from ..gate import CONFIRMED, FIX_GATE, NOTHING, PATIENCE, vote
+from ..compiling.small import add, load, store
+from ..gate import CONFIRMED, FIX_GATE, NOTHING, PATIENCE, Vector, vote
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -125,9 +125,9 @@ of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
 is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
 variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since
-m; for how long s fixes have agreed with its position; s since the last fix; whether this try takes the motion as fixes
-correct it; and what is added to the covariance m^2 for errors of fixes that last, with eight numbers of `lasting` on
-them; and nine of `gate.vote`."""
+m; for how long s fixes have agreed with its position; s since the last fix; by how many m^2 a step's motion is more
+uncertain where this try takes it as fixes correct it, else 0; and what is added to the covariance m^2 for errors of
+fixes that last, with eight numbers of `lasting` on them; and nine of `gate.vote`."""
 
 
 class Filter(NamedTuple):
@@ -263,24 +263,43 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
 
 
 @part
-def is_outvoted(f: Filter, own: Floats, rows: Floats, count: int) -> bool:
-    """Whether fixes outvote the one that the ego started at, this one among them, and no more neighbours, measured
-    whole, are where their messages say beside the ego's position than beside the fix."""
+def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
+    """Whether fixes outvote the one that the ego started at, this one among them, and no neighbours speak for that."""
     if f.ego[VOTES + 7] >= CONFIRMED:
         return False
-    g, moved, process = f.g, vector_at(own, MOTION // 3), vector_at(own, MOTION_VARIANCE // 3)
+    moved, process = vector_at(own, MOTION // 3), vector_at(own, MOTION_VARIANCE // 3)
     before, fix, noise = load(f.ego[VOTES:], 0, NO_VOTES), vector_at(own, FIX // 3), vector_at(own, FIX_VARIANCE // 3)
     votes, left = vote(before, moved, process, fix, noise)
     store(f.ego[VOTES:], 0, votes)
-    more = 0
-    for i in range(count if left > 0.0 else 0):
-        here = there = 0.0 if rows[i, AGE] >= 0.0 and measured_whole(rows, i) else math.inf
-        for c in range(3):
-            at, variance = seen_from(rows, i, c), rows[i, SOLO_VARIANCE + c] + own[FIX_VARIANCE + c] + 1.0
-            here += (at - g.x[c] - moved[c]) ** 2 / (variance + g.p[c, c])
-            there += (at - fix[c]) ** 2 / variance
-        more += int(here <= FIX_GATE) - int(there <= FIX_GATE)
-    return left > 0.0 and more <= 0
+    here = add(vector_at(f.g.x, 0), moved)
+    return left > 0.0 and speak_for(f, model, own, rows, count, here, fix) <= 0.0
+
+
+@part
+def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, here: Vector, there: Vector) -> float:
+    """By how many more neighbours, as they send their positions and the ego measures them, it is at one place than at
+    another: what the star has made of them does not count."""
+    more = 0.0
+    for i in range(count):
+        more += puts(f, model, own, rows, i, here) - puts(f, model, own, rows, i, there)
+    return more
+
+
+@part
+def puts(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) -> float:
+    """1 if a neighbour that is measured whole, or its range, puts the ego at a place, else 0."""
+    far2, near2, variance = 0.0, 0.0, 0.0
+    ranged, turned = model.std[0] ** 2 * math.exp(f.ego[LEVEL]), model.std[1] ** 2 * math.exp(f.ego[LEVEL + 1])
+    for c in range(3):
+        there = rows[i, SOLO + c] + rows[i, AGE] * rows[i, SPEED + c]
+        far2 += (there - at[c]) ** 2
+        near2 += (seen_from(rows, i, c) - at[c]) ** 2
+        variance += (rows[i, SOLO_VARIANCE + c] + own[FIX_VARIANCE + c] + 1.0) / 3.0
+    if measured_whole(rows, i):
+        total = near2 / (variance + ranged + turned * far2)
+    else:
+        total = (math.sqrt(far2) - rows[i, RELATIVE]) ** 2 / (variance + ranged)
+    return 1.0 if rows[i, AGE] >= 0.0 and rows[i, RELATIVE] >= 0.0 and total <= FIX_GATE else 0.0
 
 
 @part

@@ -320,7 +320,7 @@ def measured_motion(own: Floats) -> None:
 @part
 def corrected_motion(f: Filter, own: Floats, more: float) -> None:
     """Take the motion as fixes correct it, whose variance is larger by `more` m^2."""
-    f.ego[CORRECTED] = 1.0
+    f.ego[CORRECTED] = more
     for c in range(3):
         own[MOTION + c] += own[BY_FIXES + c]
         own[MOTION_VARIANCE + c] += more
@@ -440,6 +440,11 @@ def moved(f: Filter, own: Floats) -> None:
     q = own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
     f.ego[MADE] += q
     more, f.ego[WHOLE] = max(ego_variance(f) - f.ego[WHOLE], q), ego_variance(f)
+    if f.ego[NOW] > 0.0:  # where odometry alone leads
+        level = math.exp(f.ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
+        more = max(q - 3.0 * level * f.ego[CORRECTED], 0.0)
+        for c in range(3):
+            f.ego[LEFT + c] -= own[BY_FIXES + c] if f.ego[CORRECTED] > 0.0 else 0.0
     f.ego[LEFT + 3] += more / 3.0
 
 
