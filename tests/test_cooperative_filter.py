@@ -241,6 +241,21 @@ def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
     assert np.linalg.norm(x - fleet.position[late:, 24], axis=-1).mean() < 1.8
 
 
+@pytest.mark.parametrize("ego", [12, 24])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):
+    """Law: where ego and neighbour drift in one wind, or reverse with a speed that has no sign, ranges agree with both
+    odometries, and fixes, the neighbour's too, with neither: it took the ego's for wrong and stayed 5 to 36 m off."""
+    fleet = every(load_fleet("town10").between(0, 900), 5)
+    sensors, t = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02, range_std=0.3), fleet.t - fleet.t[0]
+    seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=3, observers=[ego]), 2)
+    signs = np.where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
+    velocity = seen.velocity * signs if reverse else seen.velocity + np.array([3.0, 0.0, 0.0])
+    ranges = np.where([True, False, False], seen.relative, np.nan)
+    x = CooperativeFilter(priors=ON_ROADS)(replace(seen, velocity=velocity, relative=ranges), [ego]).x[:, 100:, 0]
+    assert np.linalg.norm(x - fleet.position[100:, ego], axis=-1).mean() < 2.5
+
+
 def test_a_position_of_a_minute_is_kept():
     """Law: fixes that jump after a minute of agreement, and stay there, are no wrong start: they count as noisier, and
     the ego goes on by its odometry. Against the oracle, too."""

@@ -210,7 +210,7 @@ class Oracle:
 
     def reset(self) -> None:
         self.state, self.revoked, self.lone = self.blank(), {}, None
-        self.doubts, self.left, self.last, self.pending = np.zeros(2), 0.0, 0.0, 0.0
+        self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
@@ -297,9 +297,12 @@ class Oracle:
             r = self.r[t, self.ego] * self.white
             star, lone = (min(((fix - at) ** 2 / (r + np.diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
             self.doubts = math.exp(-dt / 10) * self.doubts + [star - lone, 1]
-            if level > 2.9 and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
+            _, messages, relative = self.heard(t)
+            star, lone = (sum(self.off(t, at, messages, relative)) for at in (x, y))
+            self.alike = math.exp(-dt / 10) * self.alike + star - lone
+            if (level > 2.9 or self.alike > 20) and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
                 self.state, self.revoked = copy.deepcopy(self.lone)
-                self.doubts, self.last = np.zeros(2), max(2 * self.last, 20.0)
+                self.doubts, self.last, self.alike = np.zeros(2), max(2 * self.last, 20.0), 0.0
                 self.left = self.last
         if self.left > 0:
             x, cov = y, q
@@ -701,20 +704,23 @@ class Oracle:
 
     def speak_for(self, t: int, here: Floats, there: Floats, messages: Any, relative: dict[int, Floats]) -> int:
         """How many more neighbours put the ego at one place than at another?"""
-        std, more = self.std * np.exp(self.state["level"][:3] / 2), 0
+        near = [sum(q < FIX_GATE for q in self.off(t, at, messages, relative)) for at in (here, there)]
+        return near[0] - near[1]
+
+    def off(self, t: int, place: Floats, messages: Any, relative: dict[int, Floats]) -> list[float]:
+        """How far is a place from where each neighbour puts the ego?"""
+        std, found = self.std * np.exp(self.state["level"][:3] / 2), []
         for j, message in messages.items():
             if message is None or np.isnan(relative[j][0]):
                 continue
             with np.errstate(divide="ignore"):
                 r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
-            at = message.mean + (t - message.step) * self.seen.dt * message.velocity
-            for place, sign in ((here, 1), (there, -1)):
-                gap = at - place
-                q = (np.linalg.norm(gap) - relative[j][0]) ** 2 / r
-                if np.isfinite(relative[j]).all():
-                    q = np.square(gap - to_vector(relative[j])).sum() / (r + std[1] ** 2 * gap @ gap)
-                more += sign * bool(q <= FIX_GATE)
-        return more
+            gap = message.mean + (t - message.step) * self.seen.dt * message.velocity - place
+            q = (np.linalg.norm(gap) - relative[j][0]) ** 2 / r
+            if np.isfinite(relative[j]).all():
+                q = np.square(gap - to_vector(relative[j])).sum() / (r + std[1] ** 2 * gap @ gap)
+            found.append(min(float(q), FIX_GATE))
+        return found
 
     def lost(self, t: int) -> bool:
         s = self.state

@@ -65,6 +65,7 @@ from .cooperative_state import (
     is_placed,
     measured_whole,
     new_filter,
+    off,
     set_trust,
     speak_for,
 )
@@ -97,6 +98,8 @@ from .gaussian import (
 from .lasting import add_lasting, remember_error
 from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
+    AGAINST,
+    ALIKE,
     ALONE,
     ALONE_FOR,
     ALONE_LAST,
@@ -277,13 +280,13 @@ def step(
     remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
-        compare(f, tries, model, rows, vehicles)
+        compare(f, tries, model, rows, vehicles, count)
     if model.forget > 0.0:
         add_lasting(f, tries.first)
 
 
 @inner
-def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints) -> None:
+def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints, count: int) -> None:
     """A step of the ego alone, whose answer counts where something is wrong with its star."""
     alone, doubts, own = tries.alone, tries.doubts, tries.first
     alone.ego[NOW] = alone.ego[CORRECTED] = 0.0
@@ -297,14 +300,18 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints)
         keep = math.exp(-own[DT] / MEMORY)
         doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, own) - gap_to_fix(alone, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
+        doubts[ALIKE] *= keep
+        for i in range(count):
+            doubts[ALIKE] += off(f, model, own, rows, i, vector_at(f.ego, ANSWER // 3))
+            doubts[ALIKE] -= off(f, model, own, rows, i, vector_at(alone.ego, ANSWER // 3))
         loudest = max(f.ego[LEVEL], f.ego[LEVEL + 1], f.ego[LEVEL + 2])
         if (
-            loudest > LOUDEST_NOISE
+            (loudest > LOUDEST_NOISE or doubts[ALIKE] > AGAINST)
             and doubts[COUNTED] > LEAST_COUNTED
             and doubts[EXCESS] > MOST_EXCESS * doubts[COUNTED]
         ):
             copy_filter(alone, f)
-            doubts[EXCESS] = doubts[COUNTED] = 0.0
+            doubts[EXCESS] = doubts[COUNTED] = doubts[ALIKE] = 0.0
             doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
     f.ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
     if doubts[ALONE_FOR] > 0.0:

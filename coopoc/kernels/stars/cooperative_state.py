@@ -281,13 +281,15 @@ def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, he
     another: what the star has made of them does not count."""
     more = 0.0
     for i in range(count):
-        more += puts(f, model, own, rows, i, here) - puts(f, model, own, rows, i, there)
+        more += 1.0 if off(f, model, own, rows, i, here) < FIX_GATE else 0.0
+        more -= 1.0 if off(f, model, own, rows, i, there) < FIX_GATE else 0.0
     return more
 
 
 @part
-def puts(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) -> float:
-    """1 if a neighbour that is measured whole, or its range, puts the ego at a place, else 0."""
+def off(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) -> float:
+    """Squared normalised distance of a place from where a neighbour that is measured whole, or its range, puts the ego,
+    FIX_GATE at most and where nothing does."""
     far2, near2, variance = 0.0, 0.0, 0.0
     ranged, turned = model.std[0] ** 2 * math.exp(f.ego[LEVEL]), model.std[1] ** 2 * math.exp(f.ego[LEVEL + 1])
     for c in range(3):
@@ -299,7 +301,7 @@ def puts(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector)
         total = near2 / (variance + ranged + turned * far2)
     else:
         total = (math.sqrt(far2) - rows[i, RELATIVE]) ** 2 / (variance + ranged)
-    return 1.0 if rows[i, AGE] >= 0.0 and rows[i, RELATIVE] >= 0.0 and total <= FIX_GATE else 0.0
+    return total if rows[i, AGE] >= 0.0 and rows[i, RELATIVE] >= 0.0 and total < FIX_GATE else FIX_GATE
 
 
 @part

@@ -12,9 +12,9 @@ their gate count with no more than it, a fix as one: a range that is too long, o
 Wheels slip along the way.
 
 *The star*: beside the filter runs that of the ego alone. Where the star's estimate is far from the ego's fixes, those
-of the other near, and no noise explains what is measured of neighbours, something is wrong with them all, as an angle
-of another sign or a partner of another name: the filter begins anew from the lone one, which counts for a while, twice
-as long each time.
+of the other near, and no noise explains what is measured of neighbours, or what they send speaks for the latter,
+something is wrong with them all, as an angle of another sign or odometries that err alike: the filter begins anew from
+the lone one, which counts for a while, twice as long each time.
 
 *Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
@@ -282,15 +282,17 @@ class Tries(NamedTuple):
     doubts: Floats
 
 
-EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, DOUBTS = range(6)
+EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, ALIKE, DOUBTS = range(7)
 """Of the star as a whole: sums over the ego's fixes, fading in MEMORY s, of how much larger their squared normalised
 distance from the star's estimate is than from that of the ego alone, and of 1; for how many s the latter counts from
-now on, and counted last; and sum of MORE, m^2, since the odometry has failed, KNOWN once it was taken to."""
+now on, and counted last; sum of MORE, m^2, since the odometry has failed, KNOWN once it was taken to; and fading, too,
+by how much nearer neighbours put the ego to the estimate alone than to the star's, as squared normalised distances."""
 KNOWN = -1.0
 MEMORY, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
 """s; fixes, and the mean excess, from which the star is left; the most that one distance counts."""
-LOUDEST_NOISE, FIRST_ALONE = 2.9, 20.0
-"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; s alone for the first time."""
+LOUDEST_NOISE, AGAINST, FIRST_ALONE = 2.9, 20.0, 20.0
+"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; ALIKE from which neighbours speak
+against the star; s alone for the first time."""
 
 
 @storage
