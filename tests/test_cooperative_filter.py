@@ -11,7 +11,7 @@ import pytest
 from conftest import textbook, winding
 from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
-from test_star_filters import CHANNELS, gappy, holed, partial
+from test_star_filters import CHANNELS, gappy, holed, partial, slow_fixes
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
@@ -32,6 +32,11 @@ S2 = Sensors.paper_scenario2()
 def drive(steps: int = 80) -> Fleet:
     """The start of a drive in dense traffic."""
     return load_fleet("town10-validation").between(0, steps)
+
+
+def every(fleet: Fleet, step: int) -> Fleet:
+    """A drive in longer steps."""
+    return Fleet(fleet.ids, fleet.t[::step], fleet.position[::step], fleet.velocity[::step])
 
 
 @pytest.mark.parametrize("change", [lambda r: r, holed], ids=["whole", "holed"])
@@ -158,8 +163,7 @@ def test_wheels_that_slip_leave_the_way_as_it_is(most, factor):
 def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step):
     """Law: fixes of half a metre that jump by 24 m are rejected, teach no level of motion and, once they would be used
     again, cost the receiver its trust: a neighbour knows better."""
-    whole = load_fleet("town10").between(0, 500)
-    fleet = Fleet(whole.ids, whole.t[::step], whole.position[::step], whole.velocity[::step])
+    fleet = every(load_fleet("town10").between(0, 500), step)
     sensors, steps = replace(S2, gnss_std=(0.5, 0.5, 0.5)), len(fleet.t)
     for ego in (0, 12):
         seen = observe(fleet, sensors, V2X(4), runs=2, seed=5, observers=[ego])
@@ -186,6 +190,24 @@ def test_a_wrong_start_is_left_soon_after_it(most, std, off):
     assert late.max() < 2.0 + std
 
 
+@pytest.mark.parametrize("step", [1, 10])
+@pytest.mark.parametrize(("most", "wrong"), [(0, [0]), (1, [0]), (1, [0, 1]), (3, [0]), (1, [1]), (0, [2]), (3, [4])])
+def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
+    """Law: a start is one number, which others outvote; one wrong fix after a right start harms nothing. Beside one
+    neighbour whose ranges are measured the ego stayed off for good, by as much as its first fix was."""
+    fleet, sensors = every(load_fleet("town10").between(0, 400), step), replace(S2, gnss_std=(1.0,) * 3)
+    seen = slow_fixes(observe(fleet, sensors, V2X(most), runs=2, seed=3, observers=[24]), 10 // step)
+    relative, late = seen.relative.copy(), 10 // step * (2 * len(wrong) if wrong[0] == 0 else 0)
+    relative[..., 1:] = np.nan
+    for off in (30.0, 600.0):
+        gnss = seen.gnss.copy()
+        gnss[:, 10 // step * np.array(wrong), 24] += [0.8 * off, -0.6 * off, 0.0]
+        for m in (Kalman(), JointFilter(), CooperativeFilter()):
+            for sees in (seen.relative, relative):
+                x = m(replace(seen, gnss=gnss, relative=sees), [24]).x[:, late:, 0]
+                assert np.linalg.norm(x - fleet.position[late:, 24], axis=-1).max() < 8.0
+
+
 @pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
 @pytest.mark.parametrize(("most", "start", "end"), [(0, 0, 20), (0, 20, 30), (0, 20, 50), (1, 0, 20), (1, 20, 50)])
 def test_fixes_that_were_wrong_are_forgotten_soon_after(priors, most, start, end):
@@ -202,6 +224,36 @@ def test_fixes_that_were_wrong_are_forgotten_soon_after(priors, most, start, end
         late = int(10 * (end + 10))
         error, usual = (np.linalg.norm(x[:, late:, 0] - fleet.position[late:, 24], axis=-1) for x in (ours, alone))
         assert error.mean() < (0.5 if most else 1.7 * usual.mean())
+
+
+@pytest.mark.parametrize("step", [1, 5])
+@pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
+def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
+    """Law: fixes that are led 60 m away, and are right again, are believed soon after: where they and odometry agree
+    is remembered beside a neighbour whose range does not contradict it, too. It took them for wrong for good."""
+    fleet = every(load_fleet("town10").between(0, 700), step)
+    sensors, late = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02), 500 // step
+    seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=6, observers=[24]), 10 // step)
+    gnss, relative, t = seen.gnss.copy(), seen.relative.copy(), fleet.t - fleet.t[0]
+    gnss[:, :, 24, 0] += np.where((t >= 20) & (t < 40), 3.0 * (t - 20), 0.0)
+    relative[..., 1:] = np.nan
+    x = CooperativeFilter(priors=priors)(replace(seen, gnss=gnss, relative=relative), [24]).x[:, late:, 0]
+    assert np.linalg.norm(x - fleet.position[late:, 24], axis=-1).mean() < 1.8
+
+
+@pytest.mark.parametrize("ego", [12, 24])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):
+    """Law: where ego and neighbour drift in one wind, or reverse with a speed that has no sign, ranges agree with both
+    odometries, and fixes, the neighbour's too, with neither: it took the ego's for wrong and stayed 5 to 36 m off."""
+    fleet = every(load_fleet("town10").between(0, 900), 5)
+    sensors, t = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02, range_std=0.3), fleet.t - fleet.t[0]
+    seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=3, observers=[ego]), 2)
+    signs = np.where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
+    velocity = seen.velocity * signs if reverse else seen.velocity + np.array([3.0, 0.0, 0.0])
+    ranges = np.where([True, False, False], seen.relative, np.nan)
+    x = CooperativeFilter(priors=ON_ROADS)(replace(seen, velocity=velocity, relative=ranges), [ego]).x[:, 100:, 0]
+    assert np.linalg.norm(x - fleet.position[100:, ego], axis=-1).mean() < 2.5
 
 
 def test_a_position_of_a_minute_is_kept():

@@ -1,5 +1,5 @@
 """Innovation gating: a redescending weight of the normalised innovation squared, release after lock-out, and return to
-an earlier position.
+an earlier position; votes on a start.
 
 A counter sums the gains that rejected measurements would have had; above PATIENCE gating is suspended. These
 measurements then hold, together, more information than the prediction that contradicts them. A filter with a small
@@ -9,6 +9,9 @@ A rejected fix does not show whether the receiver or the filter is wrong. So the
 the first fix that contradicted it, moved by the odometer alone. Once fixes agree with that position again, and no
 longer with the estimate, the filter returns to it.
 
+A start is one number: until a few fixes have agreed with it, it is left where more of them agree with
+one another.
+
 A number, or LANES runs side by side. Filters call it where a measurement becomes information; blocks of the
 cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 """
@@ -16,7 +19,17 @@ cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 import math
 
 from .compiling.compile import inside
-from .compiling.small import add, add_diagonal, apply, from_upper, inner_product, inverse, scale, subtract
+from .compiling.small import (
+    add,
+    add_diagonal,
+    apply,
+    choose_each,
+    from_upper,
+    inner_product,
+    inverse,
+    scale,
+    subtract,
+)
 from .compiling.vectors import choose
 
 GATE, FIX_GATE = 9.0, 12.0
@@ -42,8 +55,14 @@ EVIDENCE = 2.0
 more than that of a fix that is just rejected, than those of the position that is remembered."""
 NOTHING = 1e30
 """m^2, variance of a position that is not remembered."""
-FORGET, KEEP, BEGIN, BACK = -1.0, 0.0, 1.0, 2.0
-"""What `remember` returns."""
+FORGET, KEEP, BEGIN, BACK, ANEW = -1.0, 0.0, 1.0, 2.0, 3.0
+"""What `remember` returns, and that a start is left."""
+CONFIRMED = 5.0
+"""Fixes that agree with a start, itself among them, from which it is right."""
+MOST = HARD_REJECT_FACTOR * FIX_GATE
+"""Squared normalised distance of two fixes, up to which they agree."""
+UNSEEN = 1e15
+"""m^2, variance of no fix."""
 Vector = tuple[float, ...]
 
 
@@ -89,6 +108,43 @@ def remember(
     begin = choose(q - gate, spread - 0.5 * NOTHING, none)
     evidence = choose(begin, none, evidence)
     return choose(begin, BEGIN + none, choose(q - gate, back, what)), evidence, since
+
+
+@inside
+def vote(votes: Vector, moved: Vector, process: Vector, fix: Vector, variance: Vector) -> tuple[Vector, float]:
+    """The next votes on a start, and above 0 where more fixes agree on another position: a filter begins anew at the
+    newest. What else the filter knows, as neighbours, does not count: they stand beside a start that may be wrong.
+
+    Args:
+        votes: start m, the other position less that m, variance of either m^2, and fixes that agree with each.
+        moved: m, by odometry.
+        process: m^2, variance of that.
+        fix: m, NaN for none.
+        variance: m^2, UNSEEN at least for none.
+    """
+    at, apart, ours, theirs = add(votes[:3], moved), votes[3:6], votes[7], votes[8]
+    spread = votes[6] + (process[0] + process[1] + process[2]) / 3.0
+    o, gap = 0.0 * spread, subtract(fix, at)
+    q, other = apart_by(gap, variance, spread), apart_by(subtract(gap, apart), variance, spread)
+    seen = choose(UNSEEN - variance[0], o + 1.0, o)
+    agrees, far = choose(MOST - q, seen, o), choose(q - MOST, seen, o)
+    begins = choose(0.5 - ours, agrees + far, o)
+    new = choose(other - MOST, far, o)
+    ours, theirs = ours + choose(begins, o + 1.0, agrees), choose(begins, o, choose(new, o + 1.0, theirs + far))
+    left = choose(CONFIRMED - votes[7], theirs - ours, o)
+    left = choose(begins, o, choose(far, left, o))
+    anew = choose(begins, begins, left)
+    apart = choose_each(left, subtract(at, fix), choose_each(new, gap, apart))
+    ours, theirs = choose(left, theirs, ours), choose(left, ours, theirs)
+    return (*choose_each(anew, fix, at), *apart, choose(anew, o, spread), ours, theirs), left
+
+
+@inside
+def apart_by(gap: Vector, variance: Vector, spread: float) -> float:
+    """Squared normalised distance of two fixes, one of them moved."""
+    a, b, c = gap
+    s = spread + SLIP
+    return a * a / (2.0 * variance[0] + s) + b * b / (2.0 * variance[1] + s) + c * c / (2.0 * variance[2] + s)
 
 
 @inside

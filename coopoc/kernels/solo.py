@@ -1,8 +1,9 @@
 """The solo Kalman filter on position, axis by axis.
 
-The state of an axis is (x, variance, hits, before, spread, evidence, since): its position m and variance m^2; `hits`
-are those of fixes beyond the gate, and the rest is the position that `gate.remember` is about, m, its variance m^2, and
-the memory of that; all but these two are the same on all axes.
+The state of an axis is (x, variance, hits, before, spread, evidence, since, start, apart, and three votes): its
+position m and variance m^2; `hits` are those of fixes beyond the gate, then comes the position that `gate.remember` is
+about, m, its variance m^2, and the memory of that, and what `gate.vote` is about; positions and variances are of the
+axis, the rest is the same on all.
 """
 
 import math
@@ -14,12 +15,13 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, inside, part
 from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import BACK, BEGIN, KEEP, NOTHING, SLIP, count, inflation, remember
+from .gate import ANEW, BACK, BEGIN, CONFIRMED, KEEP, NOTHING, SLIP, count, inflation, remember, vote
 from .motion import MotionNoise
 
-AxisState: TypeAlias = tuple[float, float, float, float, float, float, float]
-STATE: AxisState = (0.0, 0.0, 0.0, 0.0, NOTHING, 0.0, 0.0)
-"""Before the first fix; its length is the count that `load` takes."""
+AxisState: TypeAlias = tuple[float, ...]
+START, APART, VOTES = 7, 8, 9
+STATE: AxisState = (0.0, 0.0, 0.0, 0.0, NOTHING, 0.0, 0.0, 0.0, 0.0, 0.0, CONFIRMED, 0.0)
+"""At a position that is known; its length is the count that `load` takes."""
 Vector: TypeAlias = tuple[float, float, float]
 Gated: TypeAlias = tuple[float, float, float, float, float]
 
@@ -57,9 +59,24 @@ class SoloMeasurements(NamedTuple):
 
 
 @inside
-def start_state(x: float, variance: float) -> AxisState:
+def start_state(x: float, variance: float, votes: float) -> AxisState:
     """State at a position."""
-    return x, variance, 0.0, 0.0, NOTHING, 0.0, 0.0
+    return x, variance, 0.0, 0.0, NOTHING, 0.0, 0.0, x, 0.0, 0.0, votes, 0.0
+
+
+@inside
+def is_outvoted(states: Floats, moved: Vector, process: Vector, fix: Vector, noise: Vector) -> bool:
+    """Whether a start is left, after this fix (`gate.vote`)."""
+    if states[0, VOTES + 1] >= CONFIRMED:
+        return False
+    start = states[0, START], states[1, START], states[2, START]
+    apart = states[0, APART], states[1, APART], states[2, APART]
+    spread, ours, theirs = states[0, VOTES], states[0, VOTES + 1], states[0, VOTES + 2]
+    votes, left = vote((*start, *apart, spread, ours, theirs), moved, process, fix, noise)
+    for c in range(3):
+        states[c, START], states[c, APART] = votes[c], votes[3 + c]
+        states[c, VOTES], states[c, VOTES + 1], states[c, VOTES + 2] = votes[6], votes[7], votes[8]
+    return left > 0.0
 
 
 @inside
@@ -69,6 +86,8 @@ def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, noise:
     q, other, gain, apart, spread, hits = 0.0, 0.0, 0.0, 0.0, 0.0, states[0, 2]
     if gate == 0.0:
         return 1.0, hits, KEEP, 0.0, 0.0
+    if is_outvoted(states, moved, process, fix, noise):
+        return math.inf, 0.0, ANEW, 0.0, 0.0
     for c in range(3):
         innovation = fix[c] - states[c, 0] - moved[c]
         if not math.isnan(innovation):
@@ -95,9 +114,11 @@ def step(state: AxisState, moved: float, process: float, fix: float, noise: floa
 
     x += k (z - x), k = p / (p + f r), p = (1 - k)^2 p + k^2 f r.
     """
-    (x, p, _, before, spread, _, _), (f, hits, what, evidence, since) = state, gated
+    (x, p, _, before, spread), (f, hits, what, evidence, since) = state[:5], gated
     x, p, before, spread = x + moved, p + process, before + moved, spread + process
-    if what == BEGIN:
+    if what == ANEW:
+        x, p = fix, noise
+    elif what == BEGIN:
         before, spread = x, p
     elif what != KEEP:
         if what == BACK:
@@ -106,7 +127,7 @@ def step(state: AxisState, moved: float, process: float, fix: float, noise: floa
     if not (math.isnan(fix) or math.isinf(f)):
         k = p / (p + f * noise)
         x, p = x + k * (fix - x), (1.0 - k) * (1.0 - k) * p + k * k * f * noise
-    return x, p, hits, before, spread, evidence, since
+    return x, p, hits, before, spread, evidence, since, *state[START:]
 
 
 @compiled
@@ -151,9 +172,9 @@ def filter_runs(
                 gated = gate_fix(states[e], moved, q, fix, r, gate if t > 0 else 0.0)
                 for c in range(3):
                     if t == 0 and exact:
-                        state = start_state(x[run, 0, at, c], 0.0)
+                        state = start_state(x[run, 0, at, c], 0.0, CONFIRMED)
                     elif t == 0 or math.isnan(states[e, c, 0] + moved[c]):
-                        state = start_state(fix[c], r[c])
+                        state = start_state(fix[c], r[c], 1.0)
                     else:
                         state = step(load(states[e, c], 0, STATE), moved[c], q[c], fix[c], r[c], gated)
                     store(states[e, c], 0, state)
@@ -170,7 +191,7 @@ def stream_step(row: Floats, state: Floats, history: Floats, odometry: Floats, n
 
     Args:
         row: (8,) fix m, velocity m/s, dt s, age of the fix s.
-        state: (3, 7).
+        state: (3, 12).
         history: of `motion`.
         odometry: of `dead_reckon`.
         noise: (13,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
@@ -187,7 +208,7 @@ def stream_step(row: Floats, state: Floats, history: Floats, odometry: Floats, n
     gated = gate_fix(state, three(answer), three(q), fix, r, noise[12])
     for c in range(3):
         if starts:
-            store(state[c], 0, start_state(fix[c], r[c]))
+            store(state[c], 0, start_state(fix[c], r[c], 1.0))
         else:
             store(state[c], 0, step(load(state[c], 0, STATE), answer[c], q[c], fix[c], r[c], gated))
     answer[:] = 0.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
+from coopoc.kernels.gate import AWAY, CONFIRMED, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
 from coopoc.kernels.odometry_fault import DECISIVE
 from coopoc.kernels.stars.cooperative_members import CHANGES, CONTRADICTED, WIDEST
 from coopoc.kernels.stars.cooperative_messages import (
@@ -210,7 +210,7 @@ class Oracle:
 
     def reset(self) -> None:
         self.state, self.revoked, self.lone = self.blank(), {}, None
-        self.doubts, self.left, self.last, self.pending = np.zeros(2), 0.0, 0.0, 0.0
+        self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
@@ -222,7 +222,7 @@ class Oracle:
         numbers += ["score", "numbers", "squares", "late", "weight"]
         levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
         levels |= {name: np.zeros(3) for name in ("gap", "cov", "course", "recent")} | dict.fromkeys(numbers, 0.0)
-        levels |= {"products": [], "louder": {}, "left": None, "jumped": False}
+        levels |= {"products": [], "louder": {}, "left": None, "jumped": False, "votes": [], "spread": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -297,9 +297,12 @@ class Oracle:
             r = self.r[t, self.ego] * self.white
             star, lone = (min(((fix - at) ** 2 / (r + np.diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
             self.doubts = math.exp(-dt / 10) * self.doubts + [star - lone, 1]
-            if level > 2.9 and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
+            _, messages, relative = self.heard(t)
+            star, lone = (sum(self.off(t, at, messages, relative)) for at in (x, y))
+            self.alike = math.exp(-dt / 10) * self.alike + star - lone
+            if (level > 2.9 or self.alike > 20) and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
                 self.state, self.revoked = copy.deepcopy(self.lone)
-                self.doubts, self.last = np.zeros(2), max(2 * self.last, 20.0)
+                self.doubts, self.last, self.alike = np.zeros(2), max(2 * self.last, 20.0), 0.0
                 self.left = self.last
         if self.left > 0:
             x, cov = y, q
@@ -443,15 +446,14 @@ class Oracle:
         fix = self.seen.gnss[self.run, t, self.ego].copy()
         if s.get("unused") == t:
             fix[:] = np.nan
-        again = bool(g.fix_gate and t > s["began"] and np.isfinite(fix).all() and self.lost(t))
-        again = again and self.start(t, fix, messages, relative)
+        seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix, messages, relative)
+        if outvoted:
+            s["trusted"].add(self.ego)
+        again = bool(g.fix_gate) and t > s["began"] and seen
+        again = again and (outvoted or self.lost(t)) and self.start(t, fix, messages, relative)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
-                if j in others and j not in s["trusted"]:
-                    self.doubt(j)
-                for kind in "xbor":
-                    b.drop((kind, j))
-                s["members"].remove(j)
+                self.dismiss(j, j in others, outvoted)
         dt = self.seen.dt
         s["agreed"] += dt * (s["hits"].get("fix", 0) == 0)
         s["unseen"] += dt
@@ -465,12 +467,16 @@ class Oracle:
         s["made"] = s["made"] + q.sum()
         if s["left"]:
             grown = 0.0 if self.ego in s["vague"] else self.own_variance() - s["whole"]
-            s["left"] = s["left"][0], s["left"][1] + max(grown, q.sum()) / 3
+            grown, way = max(grown, q.sum()), 0.0
+            if slip:
+                corrections = louder * self.grown if self.corrected_now else 0.0
+                grown, way = max(q.sum() - 3 * corrections, 0.0), self.by[t] * dt if self.corrected_now else 0.0
+            s["left"] = s["left"][0] - way, s["left"][1] + grown / 3
         s["whole"] = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
         if np.isfinite(fix).all():
-            self.add_fix(t, fix)
+            self.add_fix(t, fix, messages, relative)
         at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
         for j in sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego]))):
             new = j in s["vague"] and messages[j] is not None
@@ -492,7 +498,14 @@ class Oracle:
         s["learned"] = np.zeros(6)
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
-    def add_fix(self, t: int, fix: Floats) -> None:
+    def dismiss(self, j: int, measured: bool, doubted: bool) -> None:
+        if measured and (doubted or j not in self.state["trusted"]):
+            self.doubt(j)
+        for kind in "xbor":
+            self.state["belief"].drop((kind, j))
+        self.state["members"].remove(j)
+
+    def add_fix(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> None:
         s, louder = self.state, math.exp(self.state["level"][3])
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
@@ -503,17 +516,17 @@ class Oracle:
             if more > most or far < 2 * math.sqrt(r.sum()):
                 s["jumped"] = more > most
             s["shown"], s["gap"], s["unseen"] = max(s["shown"] + min(more, most), 0.0), gap, 0.0
-        alone = not any(j in s["last"] for j in s["members"])
-        if self.priors.fix_gate and self.ego not in s["vague"] and alone:
-            self.go_back(fix, rows)
+        if self.priors.fix_gate and self.ego not in s["vague"]:
+            self.go_back(t, fix, rows, messages, relative)
+            rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
         s["share"] = share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
 
-    def go_back(self, fix: Floats, rows: list[Any]) -> None:
+    def go_back(self, t: int, fix: Floats, rows: list[Any], messages: Any, relative: dict[int, Floats]) -> None:
         """To where the ego was before fixes contradicted it, if it is there again."""
         s, b = self.state, self.state["belief"]
-        q, _, cov, r = self.mahalanobis(b, rows)
+        q, gap, cov, r = self.mahalanobis(b, rows)
         gate, at = max(self.priors.fix_gate, FIX_GATE), b.at(("x", self.ego))
         s["agree"] = 0.0 if q > gate else s["agree"] + float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
         if not s["left"]:
@@ -526,8 +539,18 @@ class Oracle:
             p += s["driven"] ** 2 * np.diag(b.p)[b.at(("o", self.ego))].sum() / 3
         other = ((fix - x) ** 2 / (p + r + SLIP)).sum()
         s["evidence"] = 0.0 if other > gate else max(s["evidence"] + min(q, most) - other, 0.0)
-        near = np.square(b.x[at] - x).sum() < 3 * p
+        near = np.square(b.x[at] - x + np.diag(cov) / (np.diag(cov) + r) * gap).sum() < 3 * p
         if not near and s["evidence"] > EVIDENCE * most:
+            if self.speak_for(t, b.x[at], x, messages, relative) > 0:
+                return
+            for j in list(s["members"]):
+                self.dismiss(j, j in messages, False)
+            b.drop(("b", self.ego))
+            if self.life.own:
+                b.add(("b", self.ego), 0, self.life.own)
+            s["trusted"].add(self.ego)
+            s["mean"].pop(self.ego, None)
+            at = b.at(("x", self.ego))
             b.transform(("x", self.ego), {})
             b.x[at] = x
             b.noise(("x", self.ego), p)
@@ -657,14 +680,55 @@ class Oracle:
             s["vague"].discard(self.ego)
         return True
 
+    def outvoted(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
+        """Do more fixes agree with one another elsewhere than with the start, and no more neighbours with that?"""
+        votes, r, (u, q) = self.state["votes"], self.r[t, self.ego] * self.white, self.motion(t)
+        if votes and votes[0][1] >= CONFIRMED:
+            return False
+        for at in votes:
+            at[0] += self.seen.dt * u
+        self.state["spread"] = self.state["spread"] + q.mean() if votes else 0.0
+        if np.isnan(fix).any():
+            return False
+        for at in votes:
+            if ((fix - at[0]) ** 2 / (2 * r + self.state["spread"] + SLIP)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
+                at[1] += 1
+                break
+        else:
+            votes[1:] = [[fix.copy(), 1]]
+        if votes[-1][1] <= votes[0][1]:
+            return False
+        votes[:], self.state["spread"] = [[fix.copy(), votes[1][1]], votes[0]], 0.0
+        b = self.state["belief"]
+        return self.speak_for(t, b.x[b.at(("x", self.ego))] + self.seen.dt * u, fix, messages, relative) <= 0
+
+    def speak_for(self, t: int, here: Floats, there: Floats, messages: Any, relative: dict[int, Floats]) -> int:
+        """How many more neighbours put the ego at one place than at another?"""
+        near = [sum(q < FIX_GATE for q in self.off(t, at, messages, relative)) for at in (here, there)]
+        return near[0] - near[1]
+
+    def off(self, t: int, place: Floats, messages: Any, relative: dict[int, Floats]) -> list[float]:
+        """How far is a place from where each neighbour puts the ego?"""
+        std, found = self.std * np.exp(self.state["level"][:3] / 2), []
+        for j, message in messages.items():
+            if message is None or np.isnan(relative[j][0]):
+                continue
+            with np.errstate(divide="ignore"):
+                r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
+            gap = message.mean + (t - message.step) * self.seen.dt * message.velocity - place
+            q = (np.linalg.norm(gap) - relative[j][0]) ** 2 / r
+            if np.isfinite(relative[j]).all():
+                q = np.square(gap - to_vector(relative[j])).sum() / (r + std[1] ** 2 * gap @ gap)
+            found.append(min(float(q), FIX_GATE))
+        return found
+
     def lost(self, t: int) -> bool:
         s = self.state
         held = [j for j in s["members"] if j in s["last"]]
         if any(j in s["trusted"] for j in held):
             return False
         if self.ego in s["trusted"]:
-            hits, again = s["hits"]["fix"], s["locked"].get(self.ego, 0.0) >= PATIENCE
-            return bool((hits >= 2 and t - s["joined"][self.ego] - hits <= 1) or (hits > 0 and again))
+            return bool(s["hits"]["fix"] > 0 and s["locked"].get(self.ego, 0.0) >= PATIENCE)
         b, noise = s["belief"], (self.r[t, self.ego] @ self.white) / 3
         error = b.x[b.at(("b", self.ego))]
         apart = [float(np.square(error - b.x[b.at(("b", j))]).sum()) for j in held]

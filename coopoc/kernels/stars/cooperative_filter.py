@@ -14,7 +14,7 @@ from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP, remember
 from ..geometry import angle
-from .cooperative_members import join, leave, predict, replace_implausible_velocity
+from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
@@ -65,11 +65,15 @@ from .cooperative_state import (
     is_placed,
     measured_whole,
     new_filter,
+    off,
+    set_trust,
+    speak_for,
 )
 from .gaussian import (
     COMPASS,
     COV,
     CURVE,
+    GAP,
     LIMIT,
     MEASURED,
     PLACE,
@@ -94,6 +98,8 @@ from .gaussian import (
 from .lasting import add_lasting, remember_error
 from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
+    AGAINST,
+    ALIKE,
     ALONE,
     ALONE_FOR,
     ALONE_LAST,
@@ -274,13 +280,13 @@ def step(
     remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
-        compare(f, tries, model, rows, vehicles)
+        compare(f, tries, model, rows, vehicles, count)
     if model.forget > 0.0:
         add_lasting(f, tries.first)
 
 
 @inner
-def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints) -> None:
+def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints, count: int) -> None:
     """A step of the ego alone, whose answer counts where something is wrong with its star."""
     alone, doubts, own = tries.alone, tries.doubts, tries.first
     alone.ego[NOW] = alone.ego[CORRECTED] = 0.0
@@ -294,14 +300,18 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints)
         keep = math.exp(-own[DT] / MEMORY)
         doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, own) - gap_to_fix(alone, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
+        doubts[ALIKE] *= keep
+        for i in range(count):
+            doubts[ALIKE] += off(f, model, own, rows, i, vector_at(f.ego, ANSWER // 3))
+            doubts[ALIKE] -= off(f, model, own, rows, i, vector_at(alone.ego, ANSWER // 3))
         loudest = max(f.ego[LEVEL], f.ego[LEVEL + 1], f.ego[LEVEL + 2])
         if (
-            loudest > LOUDEST_NOISE
+            (loudest > LOUDEST_NOISE or doubts[ALIKE] > AGAINST)
             and doubts[COUNTED] > LEAST_COUNTED
             and doubts[EXCESS] > MOST_EXCESS * doubts[COUNTED]
         ):
             copy_filter(alone, f)
-            doubts[EXCESS] = doubts[COUNTED] = 0.0
+            doubts[EXCESS] = doubts[COUNTED] = doubts[ALIKE] = 0.0
             doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
     f.ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
     if doubts[ALONE_FOR] > 0.0:
@@ -330,7 +340,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     for k in range(len(f.who)):
         for c in range(4):
             f.member[k, OUT + c] = math.nan
-    add_fix(f, model, own)
+    add_fix(f, model, own, rows, count)
     members = locate(f)
     for i in range(members):
         k = f.who[i, ORDER]
@@ -380,7 +390,7 @@ def gap2(f: Filter, k: int) -> float:
 
 
 @inside
-def add_fix(f: Filter, model: Model, own: Floats) -> None:
+def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share."""
     level = math.exp(f.ego[LEVEL + FIXES])
     if math.isnan(own[FIX]):
@@ -392,7 +402,8 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, FIXES)
         show(f)
-        if model.fix_gate > 0.0 and not heard(f, False) and goes_back(f, model, own, q):
+        if model.fix_gate > 0.0 and goes_back(f, model, own, rows, count, q):
+            fix_terms(f, 0)
             q = innovate(f.g, f.h)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
@@ -400,8 +411,9 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
 
 
 @inside
-def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
-    """Whether an ego alone is where it was before fixes contradicted it (`gate.remember`): then it goes back."""
+def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q: float) -> bool:
+    """Whether an ego is where it was before fixes contradicted it (`gate.remember`), and no neighbours say otherwise:
+    then it goes back, and they join anew."""
     g, h, left = f.g, f.h, f.ego[LEFT:]
     other, apart, gain, spread = 0.0, 0.0, 0.0, left[3]
     if has(g, 0, TURN) and model.absent[0] == -math.inf:  # an error that is surely there errs farther and farther
@@ -410,7 +422,8 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
     for c in range(3):
         p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
         other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP)
-        apart, gain = apart + (g.x[c] - left[c]) ** 2, gain + p / (3.0 * (p + r))
+        gain += p / (3.0 * (p + r))
+        apart += (g.x[c] - left[c] + p / (p + r) * h.three[GAP + c]) ** 2  # where this fix would put it
     gate = max(model.fix_gate, FIX_GATE)
     what, left[4], left[5] = remember(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])
     if what == BEGIN:
@@ -418,7 +431,13 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
             left[c] = g.x[c]
         left[3], left[6] = ego_variance(f) / 3.0, 0.0
         return False
+    if what == BACK and speak_for(f, model, own, rows, count, vector_at(g.x, 0), vector_at(left, 0)) > 0.0:
+        return False
     if what == BACK:
+        for k in range(1, len(f.who)):
+            if f.who[k, VEHICLE] >= 0:
+                dismiss(f, model, k, False)
+        set_trust(f, f.who[0, VEHICLE], 1.0, model.own)
         clear(g, 0)
         for c in range(3):
             g.x[c] = left[c]

@@ -32,6 +32,7 @@ from .cooperative_state import (
     WILD,
     Filter,
     Model,
+    is_outvoted,
     measured_vector,
     measured_whole,
     needs_restart,
@@ -77,17 +78,27 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.who[f.slot[vehicles[i]], INPUT] = i
-    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and needs_restart(f, model, own)
-    again = again and start(f, model, own, rows, count)
+    outvoted = model.fix_gate > 0.0 and is_outvoted(f, model, own, rows, count)
+    if outvoted:
+        set_trust(f, f.who[0, VEHICLE], 1.0, model.own)
+    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX])
+    again = again and (outvoted or needs_restart(f, own)) and start(f, model, own, rows, count)
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
         if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
-        if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
-            set_trust(f, j, 0.0, TAU**2 + model.own)
-        for kind in range(KINDS):
-            remove(f.g, k, kind)
-        f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
+        dismiss(f, model, k, outvoted)
+
+
+@part
+def dismiss(f: Filter, model: Model, k: int, doubted: bool) -> None:
+    """Remove a member; if it is still measured, what was found of its fixes, beside a wrong position, is forgotten."""
+    j = f.who[k, VEHICLE]
+    if f.who[k, INPUT] >= 0 and (doubted or f.status[j, TRUSTED] == 0.0):
+        set_trust(f, j, 0.0, TAU**2 + model.own)
+    for kind in range(KINDS):
+        remove(f.g, k, kind)
+    f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
 
 
 @inside

@@ -11,7 +11,8 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
-from ..gate import FIX_GATE, NOTHING, PATIENCE
+from ..compiling.small import add, load, store
+from ..gate import CONFIRMED, FIX_GATE, NOTHING, PATIENCE, Vector, vote
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -115,17 +116,18 @@ it was there, s, which is when it sent its newest message; the step at which it 
 that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its fixes; and, out, the squared
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
+NO_VOTES = (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 51, 54, 63
-AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, EGO = 70, 71, 72, 73, 76, 84
+AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, VOTES, EGO = 70, 71, 72, 73, 76, 84, 93
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
 is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
 variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since
-m; for how long s fixes have agreed with its position; s since the last fix; whether this try takes the motion as fixes
-correct it; and what is added to the covariance m^2 for errors of fixes that last, with eight numbers of `lasting` on
-them."""
+m; for how long s fixes have agreed with its position; s since the last fix; by how many m^2 a step's motion is more
+uncertain where this try takes it as fixes correct it, else 0; and what is added to the covariance m^2 for errors of
+fixes that last, with eight numbers of `lasting` on them; and nine of `gate.vote`."""
 
 
 class Filter(NamedTuple):
@@ -261,11 +263,53 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
 
 
 @part
-def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
-    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
-    contradict it, or fixes have for so long that they would be used again (and turn its odometry towards them); or its
-    receiver is not trusted beside others that are not. One other suffices where the error of the ego's fixes would be
-    beyond all doubt, or is the other's, too: it is the ego's."""
+def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
+    """Whether fixes outvote the one that the ego started at, this one among them, and no neighbours speak for that."""
+    if f.ego[VOTES + 7] >= CONFIRMED:
+        return False
+    moved, process = vector_at(own, MOTION // 3), vector_at(own, MOTION_VARIANCE // 3)
+    before, fix, noise = load(f.ego[VOTES:], 0, NO_VOTES), vector_at(own, FIX // 3), vector_at(own, FIX_VARIANCE // 3)
+    votes, left = vote(before, moved, process, fix, noise)
+    store(f.ego[VOTES:], 0, votes)
+    here = add(vector_at(f.g.x, 0), moved)
+    return left > 0.0 and speak_for(f, model, own, rows, count, here, fix) <= 0.0
+
+
+@part
+def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, here: Vector, there: Vector) -> float:
+    """By how many more neighbours, as they send their positions and the ego measures them, it is at one place than at
+    another: what the star has made of them does not count."""
+    more = 0.0
+    for i in range(count):
+        more += 1.0 if off(f, model, own, rows, i, here) < FIX_GATE else 0.0
+        more -= 1.0 if off(f, model, own, rows, i, there) < FIX_GATE else 0.0
+    return more
+
+
+@part
+def off(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) -> float:
+    """Squared normalised distance of a place from where a neighbour that is measured whole, or its range, puts the ego,
+    FIX_GATE at most and where nothing does."""
+    far2, near2, variance = 0.0, 0.0, 0.0
+    ranged, turned = model.std[0] ** 2 * math.exp(f.ego[LEVEL]), model.std[1] ** 2 * math.exp(f.ego[LEVEL + 1])
+    for c in range(3):
+        there = rows[i, SOLO + c] + rows[i, AGE] * rows[i, SPEED + c]
+        far2 += (there - at[c]) ** 2
+        near2 += (seen_from(rows, i, c) - at[c]) ** 2
+        variance += (rows[i, SOLO_VARIANCE + c] + own[FIX_VARIANCE + c] + 1.0) / 3.0
+    if measured_whole(rows, i):
+        total = near2 / (variance + ranged + turned * far2)
+    else:
+        total = (math.sqrt(far2) - rows[i, RELATIVE]) ** 2 / (variance + ranged)
+    return total if rows[i, AGE] >= 0.0 and rows[i, RELATIVE] >= 0.0 and total < FIX_GATE else FIX_GATE
+
+
+@part
+def needs_restart(f: Filter, own: Floats) -> bool:
+    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either fixes have contradicted
+    it for so long that they would be used again (and turn its odometry towards them), or its receiver is not trusted
+    beside others that are not. One other suffices where the error of the ego's fixes would be beyond all doubt, or is
+    the other's, too: it is the ego's."""
     ego, others, last = f.who[0, VEHICLE], 0, 0
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
@@ -273,10 +317,8 @@ def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
             if f.status[j, TRUSTED] > 0.0:
                 return False
             others, last = others + 1, k
-    hits = f.who[0, HITS]
     if f.status[ego, TRUSTED] > 0.0:
-        young = f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
-        return (hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE)
+        return f.who[0, HITS] > 0 and f.member[0, LOCKED] >= PATIENCE
     far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):

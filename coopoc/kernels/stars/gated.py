@@ -14,8 +14,22 @@ from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, inner_product, load, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose, take
-from ..gate import FIX_GATE, INITIAL_LOCKOUT, LEAK, NOTHING, distance, gain_of, gated_update, inflation, remember
-from ..geometry import Numbers, axes, direction, incomplete, residuals
+from ..gate import (
+    ANEW,
+    BACK,
+    FIX_GATE,
+    INITIAL_LOCKOUT,
+    LEAK,
+    NOTHING,
+    UNSEEN,
+    distance,
+    gain_of,
+    gated_update,
+    inflation,
+    remember,
+    vote,
+)
+from ..geometry import Numbers, axes, direction, incomplete, residuals, vector, whole
 from .messages import (
     BLOCK,
     RELATIVE,
@@ -29,7 +43,7 @@ from .messages import (
     vector_at,
 )
 
-STATE, BEFORE = (0.0,) * 13, (0.0,) * 14
+STATE, BEFORE, VOTES = (0.0,) * 13, (0.0,) * 14, (0.0,) * 9
 
 
 class Gates(NamedTuple):
@@ -41,11 +55,13 @@ class Gates(NamedTuple):
         last: of the last star.
         before: (14,) where the ego was before fixes contradicted it m, covariance m^2, and the evidence and time of
             `gate.remember`.
+        votes: (9,) of `gate.vote`.
     """
 
     state: Floats
     last: Floats
     before: Floats
+    votes: Floats
 
 
 @storage
@@ -53,7 +69,8 @@ def gates_within(most: int) -> Gates:
     """Room for `most` members."""
     before = np.zeros((len(BEFORE), LANES))
     before[3:12:4] = NOTHING
-    return Gates(np.zeros((13 * most, LANES)), np.zeros((13 * most, LANES)), before)
+    state = np.zeros((2, 13 * most, LANES))
+    return Gates(state[0], state[1], before, np.zeros((len(VOTES), LANES)))
 
 
 @inner
@@ -67,24 +84,57 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
     store(gates.before, 0, (*there, *spread, *memory[12:]))
     for k in range(n):
         previous, process = star.previous[k], process_of(star, k)
-        before = load(gates.last, max(previous, 0), STATE)
         if previous < 0:
-            y, f = 0.0 * own[0] + INITIAL_LOCKOUT, 0.0 * own[0] + flat
-            before, process = (*zeros(y, BLOCK), y, y, y, 0.0 * y), (f, f, f)
-            process = variance_of(star, 0) if k == 0 else process
-        elif k > 0:
-            process = add(process, own)
+            store(gates.state, k, fresh(star, k, flat))
+            continue
+        before = load(gates.last, previous, STATE)
+        process = add(process, own) if k > 0 else process
         store(gates.state, k, (*add_diagonal(before[:9], process), *before[9:]))
 
 
+@inside
+def fresh(star: Star, k: int, flat: float) -> Numbers:
+    """What is remembered of a member that joins, or of an ego at its fix."""
+    o = 0.0 * variance_of(star, 0)[0]
+    f, y = o + flat, o + INITIAL_LOCKOUT
+    variance = (f, f, f) if k > 0 else variance_of(star, 0)
+    return (*add_diagonal(zeros(o, BLOCK), variance), y, y, y, o)
+
+
+@inside
+def forget(star: Star, gates: Gates, k: int, where: float, flat: float) -> None:
+    """Let a member join anew where a number is above 0."""
+    store(gates.state, k, choose_each(where, fresh(star, k, flat), load(gates.state, k, STATE)))
+
+
 @inner
-def go_back(star: Star, gates: Gates, state: Floats) -> float:
-    """Above 0 where the ego goes back to where it was before fixes contradicted it: its state and covariance are."""
+def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
+    """How many neighbours, measured whole, are where their messages say if the ego is at a position."""
+    agree = o = 0.0 * at[0]
+    own = add(variance, variance_of(star, 0))
+    noise = add(own, (o + 1.0, o + 1.0, o + 1.0))
+    for k in range(1, n):
+        polar = load(star.relative, k, RELATIVE)
+        gap, sent = subtract(position_of(star, k), add(at, vector(polar))), variance_of(star, k)
+        q = distance(gap, add_diagonal(zeros(o, BLOCK), add(noise, sent)))
+        agree = agree + choose(o + FIX_GATE - q, choose(o + UNSEEN - sent[0], whole(polar), o), o)
+    return agree
+
+
+@inner
+def go_back(star: Star, gates: Gates, state: Floats, n: int) -> float:
+    """BACK where the ego goes back to where it was before fixes contradicted it: its state and covariance are; ANEW
+    where fixes outvote its start, and neighbours do not speak for that; else 0."""
     at, ego, memory = vector_at(state, 0), load(gates.state, 0, STATE), load(gates.before, 0, BEFORE)
     fix, variance, there, spread = position_of(star, 0), variance_of(star, 0), memory[:3], memory[3:12]
+    votes, left = vote(load(gates.votes, 0, VOTES), moved_of(star, 0), process_of(star, 0), fix, variance)
+    store(gates.votes, 0, votes)
     q = distance(subtract(fix, at), add_diagonal(ego[:9], variance))
     o = 0.0 * q
-    if q <= o + FIX_GATE and o + NOTHING <= spread[0]:
+    if not left <= o:
+        more = supporters(star, n, at, (ego[0], ego[4], ego[8])) - supporters(star, n, fix, zeros(o, ROW))
+        left = choose(more, o, left)
+    if q <= o + FIX_GATE and o + NOTHING <= spread[0] and left <= o:
         return o
     gap, other = subtract(there, at), distance(subtract(fix, there), add_diagonal(spread, variance))
     apart, wide, gain = inner_product(gap, gap), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
@@ -95,7 +145,7 @@ def go_back(star: Star, gates: Gates, state: Floats) -> float:
     store(gates.before, 0, (*choose_each(begins, at, there), *kept, evidence, since))
     store(gates.state, 0, (*choose_each(back, spread, ego[:9]), *ego[9:12], choose(back, o, ego[12])))
     store(state, 0, choose_each(back, there, at))
-    return back
+    return choose(left, o + ANEW, choose(back, o + BACK, o))
 
 
 @inner

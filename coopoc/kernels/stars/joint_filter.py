@@ -37,8 +37,9 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose, take
+from ..gate import BACK
 from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
-from .gated import Gates, carry, gate_star, gates_within, go_back, set_ego
+from .gated import Gates, carry, forget, gate_star, gates_within, go_back, set_ego
 from .messages import (
     BLOCK,
     NEW,
@@ -342,14 +343,16 @@ def step(
     predict_state(star, joint, n, old)
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
     rearrange(star, joint, n, old, (flat, flat, flat))
-    place_on_broadcast(star, joint, n)
     if robust:
         carry(star, gates, model.flat, n, old)
-        for k in range(1, n):
-            store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
-        back = go_back(star, gates, joint.state)
+        back = go_back(star, gates, joint.state, n)
         if not back <= 0.0 * back:
             place_ego(joint, back, block_at(gates.state, 0), n)
+            begin_anew(star, joint, gates, back - BACK, model.flat, n)
+    place_on_broadcast(star, joint, n)
+    if robust:
+        for k in range(1, n):
+            store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
         gate_star(star, gates, joint.state, joint.move, model.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
@@ -364,6 +367,21 @@ def place_ego(joint: Joint, where: float, cov: Numbers, n: int) -> None:
     process = choose(where, o, o + UNMOVED)
     predict_block(joint.information, n - 1, n, joint.stride, (process, process, process), joint.scratch)
     store(joint.information, at, choose_each(where, inverse(cov), block_at(joint.information, at)))
+
+
+@inner
+def begin_anew(star: Star, joint: Joint, gates: Gates, where: float, flat: float, n: int) -> None:
+    """Forget all, where a number is above 0: the ego starts at its fix, and its neighbours join."""
+    o = 0.0 * where
+    f = o + 1.0 / flat
+    for i in range(n):
+        at = position_of(star, 0) if i == 0 else first_place(star, i, vector_at(joint.state, 0))
+        store(joint.state, i, choose_each(where, at, vector_at(joint.state, i)))
+        forget(star, gates, i, where, flat)
+        for j in range(i, n):
+            unknown, block = zeros(o, BLOCK), i * joint.stride + j
+            unknown = add_diagonal(unknown, (f, f, f)) if i == j else unknown
+            store(joint.information, block, choose_each(where, unknown, block_at(joint.information, block)))
 
 
 @inner

@@ -12,9 +12,9 @@ their gate count with no more than it, a fix as one: a range that is too long, o
 Wheels slip along the way.
 
 *The star*: beside the filter runs that of the ego alone. Where the star's estimate is far from the ego's fixes, those
-of the other near, and no noise explains what is measured of neighbours, something is wrong with them all, as an angle
-of another sign or a partner of another name: the filter begins anew from the lone one, which counts for a while, twice
-as long each time.
+of the other near, and no noise explains what is measured of neighbours, or what they send speaks for the latter,
+something is wrong with them all, as an angle of another sign or odometries that err alike: the filter begins anew from
+the lone one, which counts for a while, twice as long each time.
 
 *Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
@@ -282,15 +282,17 @@ class Tries(NamedTuple):
     doubts: Floats
 
 
-EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, DOUBTS = range(6)
+EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, ALIKE, DOUBTS = range(7)
 """Of the star as a whole: sums over the ego's fixes, fading in MEMORY s, of how much larger their squared normalised
 distance from the star's estimate is than from that of the ego alone, and of 1; for how many s the latter counts from
-now on, and counted last; and sum of MORE, m^2, since the odometry has failed, KNOWN once it was taken to."""
+now on, and counted last; sum of MORE, m^2, since the odometry has failed, KNOWN once it was taken to; and fading, too,
+by how much nearer neighbours put the ego to the estimate alone than to the star's, as squared normalised distances."""
 KNOWN = -1.0
 MEMORY, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
 """s; fixes, and the mean excess, from which the star is left; the most that one distance counts."""
-LOUDEST_NOISE, FIRST_ALONE = 2.9, 20.0
-"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; s alone for the first time."""
+LOUDEST_NOISE, AGAINST, FIRST_ALONE = 2.9, 20.0, 20.0
+"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; ALIKE from which neighbours speak
+against the star; s alone for the first time."""
 
 
 @storage
@@ -320,7 +322,7 @@ def measured_motion(own: Floats) -> None:
 @part
 def corrected_motion(f: Filter, own: Floats, more: float) -> None:
     """Take the motion as fixes correct it, whose variance is larger by `more` m^2."""
-    f.ego[CORRECTED] = 1.0
+    f.ego[CORRECTED] = more
     for c in range(3):
         own[MOTION + c] += own[BY_FIXES + c]
         own[MOTION_VARIANCE + c] += more
@@ -440,6 +442,11 @@ def moved(f: Filter, own: Floats) -> None:
     q = own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
     f.ego[MADE] += q
     more, f.ego[WHOLE] = max(ego_variance(f) - f.ego[WHOLE], q), ego_variance(f)
+    if f.ego[NOW] > 0.0:  # where odometry alone leads
+        level = math.exp(f.ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
+        more = max(q - 3.0 * level * f.ego[CORRECTED], 0.0)
+        for c in range(3):
+            f.ego[LEFT + c] -= own[BY_FIXES + c] if f.ego[CORRECTED] > 0.0 else 0.0
     f.ego[LEFT + 3] += more / 3.0
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled
 from ..dead_reckoning import BAD_INPUT, ROUNDING, dead_reckon
+from ..gate import CONFIRMED
 from ..motion import MotionNoise, keep_pace, process_variance
 from .cooperative_filter import step
 from .cooperative_messages import remember
@@ -32,6 +33,7 @@ from .cooperative_state import (
     STEP,
     STEPS,
     TYPICAL,
+    VOTES,
     Filter,
     Model,
     begin,
@@ -133,7 +135,7 @@ def stream_step(
             return False
         begin(f, model, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
-            f.ego[STEPS], f.member[0, EXTRA_VARIANCE] = 1, 0.0
+            f.ego[STEPS], f.ego[VOTES + 7], f.member[0, EXTRA_VARIANCE] = 1, CONFIRMED, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
     step(f, tries, model, own, rows, vehicles, len(vehicles))
