@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, JointFilter, Kalman, NoiseModel, Recording, observe
 from coopoc.arrays import Floats
-from coopoc.kernels.odometry_fault import COUNTS, JERKY, NOISIER, UNKNOWN
+from coopoc.kernels.odometry_fault import JERKY, MAX_Q, NOISIER, UNKNOWN
 from coopoc.methods.odometry_fault import with_odometry
 from coopoc.world.body_frames import turned
 
@@ -91,7 +91,7 @@ def test_the_correction_is_the_velocity_of_filterpys_filter():
         peer.predict(Q=walk + np.diag([process, process, 0.0, 0.0]))
         peer.x[:2] += way
         peer.update(seen.gnss[0, k, EGOS[0], :2])
-        level = max(level * (1 + NOISIER * (0.5 * min(float(peer.y @ peer.SI @ peer.y), COUNTS) - 1)), 1.0)
+        level = max(level * (1 + NOISIER * (0.5 * min(float(peer.y @ peer.SI @ peer.y), MAX_Q) - 1)), 1.0)
         found.append(peer.x[2:].copy())
     wrong = np.flatnonzero(noise.extra[0, 10:, EGOS[0]]) + 10
     assert len(wrong) > 150

@@ -18,7 +18,7 @@ from .compiling.compile import compiled
 
 BANK = 0.02 * 1.6 ** np.arange(12)
 """w, from a straight road at a steady speed to fixes that hardly depend on each other."""
-FIRST = 6
+FIRST_FILTER = 6
 """Which of them holds before anything was seen."""
 REMEMBERS = 30.0
 """s, in which what filters have predicted is forgotten."""
@@ -26,7 +26,7 @@ PRIOR = 6.0
 """Numbers that R, as it is stated, counts as."""
 TINY = 1e-12
 """m^2, least R."""
-BEYOND = 3.0
+CLIP_STDS = 3.0
 """Standard deviations at which an innovation is clipped."""
 
 
@@ -51,7 +51,7 @@ def constant_velocity(
     velocity, growth, spread, proved = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count)
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
     p, score = np.zeros((models, 3)), np.zeros((models, 3))
-    v, best = np.zeros(3), FIRST
+    v, best = np.zeros(3), FIRST_FILTER
     score[:, 0], score[:, 1] = PRIOR, PRIOR * variance
     for j in range(count):
         dt = t[j] - t[j - 1] if j > 0 else math.inf
@@ -73,7 +73,7 @@ def constant_velocity(
                 v[c] = fixes[j, c] - x[m, c]
                 square += v[c] * v[c]
             numbers, squares, logs = score[m]
-            limit = 3.0 * BEYOND**2 * max(squares / numbers, TINY) * s
+            limit = 3.0 * CLIP_STDS**2 * max(squares / numbers, TINY) * s
             clip = math.sqrt(limit / square) if square > limit else 1.0
             for c in range(3):
                 x[m, c] += clip * a / s * v[c]

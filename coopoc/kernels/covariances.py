@@ -13,7 +13,7 @@ from .geometry import direction, five, residuals, with_std
 from .stars.gaussian import distance
 from .stars.messages import BLOCK, block_at, vector_at
 
-LIMIT = 1.0 + 1e-9
+MAX_CORRELATION2 = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
 TOGETHER, DOUBT = 5, 36.0
 """Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond
@@ -29,9 +29,13 @@ def unsound(cov: Floats) -> int:
         a, b, c, d, e, f = p[0, 0], p[1, 1], p[2, 2], p[1, 0], p[2, 0], p[2, 1]
         skew = max(abs(p[0, 1] - d), abs(p[0, 2] - e), abs(p[1, 2] - f))
         det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-        sides = d * d <= LIMIT * a * b and e * e <= LIMIT * a * c and f * f <= LIMIT * b * c
-        sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - LIMIT) * a * b * c
-        if not (sound and skew <= (LIMIT - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
+        sides = (
+            d * d <= MAX_CORRELATION2 * a * b
+            and e * e <= MAX_CORRELATION2 * a * c
+            and f * f <= MAX_CORRELATION2 * b * c
+        )
+        sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - MAX_CORRELATION2) * a * b * c
+        if not (sound and skew <= (MAX_CORRELATION2 - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
             count += 1
     return count
 

@@ -74,13 +74,15 @@ def inflation(q: float, gate: float, hits: float) -> float:
     So the influence of an innovation falls as 1 / sqrt(q), and ends.
     """
     share = choose(q - HARD_REJECT_FACTOR * gate, math.inf, max(q / gate, 1.0))
-    return choose(PATIENCE - hits, share, 1.0)
+    answer: float = choose(PATIENCE - hits, share, 1.0)
+    return answer
 
 
 @inside
 def count(q: float, gate: float, hits: float, gain: float) -> float:
     """Next value of the lock-out counter: the gains of measurements beyond the gate, less LEAK of those within."""
-    return choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
+    answer: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
+    return answer
 
 
 @inside
@@ -157,7 +159,8 @@ def gain_of(cov: Vector, variance: Vector) -> float:
 @inside
 def distance(innovation: Vector, cov: Vector) -> float:
     """Squared normalised innovation of a position."""
-    return inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation))
+    answer: float = inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation))
+    return answer
 
 
 @inside

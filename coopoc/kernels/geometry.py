@@ -97,7 +97,8 @@ def series(sine: float, cosine: float) -> float:
     s = t * t
     tail = less(1 / 17, s, less(1 / 19, s, less(1 / 21, s, less(1 / 23, s, 1 / 25))))
     tail = less(1 / 9, s, less(1 / 11, s, less(1 / 13, s, less(1 / 15, s, tail))))
-    return t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
+    answer: float = t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
+    return answer
 
 
 @inner
@@ -145,7 +146,8 @@ def spread(polar: Numbers, a: float, b: float, c: float) -> Numbers:
     _, sa, ca, si, ci = polar
     flat, cross = plus(a * si * si, c * ci, ci), (a - c) * si * ci
     xx, yy, zz = plus(flat * ca * ca, b * sa, sa), plus(flat * sa * sa, b * ca, ca), plus(a * ci * ci, c * si, si)
-    return from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
+    answer: tuple[float, ...] = from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
+    return answer
 
 
 @inside
@@ -206,7 +208,8 @@ def incomplete(measured: Numbers) -> bool:
 def whole(measured: Numbers) -> float:
     """1 where all components were measured, else 0."""
     o = 0.0 * measured[0]
-    return choose(missing(measured), o, o + 1.0)
+    answer: float = choose(missing(measured), o, o + 1.0)
+    return answer
 
 
 @inner

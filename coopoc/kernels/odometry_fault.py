@@ -20,7 +20,7 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
 from .motion import MotionNoise
 
-PLACE, ERROR, VARIANCE, BELIEVED, SURE, LEVEL, FAILS, EVIDENCE = 0, 2, 4, 7, 9, 10, 11, 12
+PLACE, ERROR, VARIANCE, BELIEVED, SURE_UNTIL, LEVEL, FAILS, EVIDENCE = 0, 2, 4, 7, 9, 10, 11, 12
 LASTS, PATH, BEFORE, SPEED, FASTEST = 13, 14, 15, 17, 18
 """Places in a state, when fixes were last taken: position m and b m/s with the variances and covariance (pp, pb, bb)
 of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
@@ -34,20 +34,20 @@ TOGETHER = 0.4
 """s, of which fixes are taken together."""
 JERKY = 1.0
 """m^2/s^3, density of the acceleration of b."""
-FAR, COUNTS = 14.0, 25.0
+RESTART_Q, MAX_Q = 14.0, 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
-DECISIVE, MOST = 15.0, 18.0
+DECISIVE, MAX_EVIDENCE = 15.0, 18.0
 """Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
-SHARE, RATE, DEVIATIONS, LONG = 0.2, 0.5, 5.0, 2.0
+ERRS_SHARE, ERRS_RATE, ERRS_STDS, ERRS_SECONDS = 0.2, 0.5, 5.0, 2.0
 """Of the way, m for each second, and deviations of a fix: it errs by as much at least, for as many s."""
 FASTER = 2.0
-"""Times the fastest by odometry that a vehicle may go, if that is above RATE."""
+"""Times the fastest by odometry that a vehicle may go, if that is above ERRS_RATE."""
 WANDERS = 2.0
 """s, in which the errors of all fixes may change together."""
 NOISIER, UNKNOWN = 0.1, 4.0
 """Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
 for at first, and that of odometry all the time."""
-LATE = 10.0
+SPEED_MEMORY = 10.0
 """s, for which a speed is remembered."""
 
 
@@ -82,7 +82,8 @@ def correct(state: Floats, velocity: Floats, dt: float) -> float:
     velocity[0] += state[ERROR]
     velocity[1] += state[ERROR + 1]
     grown = dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2]
-    return 2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0
+    answer: float = 2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0
+    return answer
 
 
 @part
@@ -94,7 +95,7 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     if math.isnan(state[PLACE]):
         for i in range(BASE):
             state[i] = 0.0
-        state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, UNKNOWN
+        state[VARIANCE], state[VARIANCE + 2], state[SURE_UNTIL], state[LEVEL] = r, 1.0, r, UNKNOWN
         state[PLACE] = state[BELIEVED] = state[BEFORE] = state[FIX] = x
         state[PLACE + 1] = state[BELIEVED + 1] = state[BEFORE + 1] = state[FIX + 1] = y
         return 0.0
@@ -102,7 +103,9 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
         return 0.0
     state[FIX], state[FIX + 1], n, r = x, y, state[COUNT], r * state[LEVEL]
     east, north = x - state[PLACE] - state[WAY], y - state[PLACE + 1] - state[WAY + 1]
-    if (n * east - state[GAPS]) ** 2 + (n * north - state[GAPS + 1]) ** 2 > 2.0 * n * n * FAR * r:  # it has jumped
+    if (n * east - state[GAPS]) ** 2 + (
+        n * north - state[GAPS + 1]
+    ) ** 2 > 2.0 * n * n * RESTART_Q * r:  # it has jumped
         state[GAPS] = state[GAPS + 1] = state[TIMES] = state[COUNT] = 0.0
     state[GAPS] += east
     state[GAPS + 1] += north
@@ -112,15 +115,16 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
         return 0.0
     failed = state[FAILS] > 0.0
     gather_evidence(state, r / state[COUNT], dt)
-    if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < LONG:
+    if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < ERRS_SECONDS:
         return 0.0
     gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
-    least = max(SHARE * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
+    least = max(ERRS_SHARE * state[PATH], ERRS_RATE * state[LASTS], ERRS_STDS * math.sqrt(r))
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0
-    return gap2
+    answer: float = gap2
+    return answer
 
 
 @part
@@ -131,13 +135,13 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     speed2, true2 = east**2 + north**2, (east + state[ERROR]) ** 2 + (north + state[ERROR + 1]) ** 2
     state[FASTEST] = max(state[FASTEST], speed2)
     speed2 = max(speed2, true2) if state[FAILS] > 0.0 else speed2
-    state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / LATE, 0.0), speed2)
+    state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / SPEED_MEMORY, 0.0), speed2)
     q = state[BASE] + interval**2 * max(state[RATIO] * speed2, state[FLOOR] ** 2)
     q *= UNKNOWN * time / interval
     p, pb, bb = state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2]
     p += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
     pb, bb = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
-    sure = max(state[SURE] + q, r * time / WANDERS)
+    sure = max(state[SURE_UNTIL] + q, r * time / WANDERS)
     s, wide = p + r, sure + r
     square = believed = 0.0
     for c in range(2):
@@ -150,8 +154,8 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
         state[BEFORE + c] += state[WAY + c]
         state[BELIEVED + c] += state[WAY + c]
         state[WAY + c] = gap  # until the update below
-    anew, gain = square > FAR, pb / s
-    share, trust = 1.0 if anew else p / s, 1.0 if believed > FAR else sure / wide
+    anew, gain = square > RESTART_Q, pb / s
+    share, trust = 1.0 if anew else p / s, 1.0 if believed > RESTART_Q else sure / wide
     for c in range(2):
         gap = state[GAPS + c]
         state[PLACE + c] += share * gap
@@ -161,13 +165,13 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
         state[GAPS + c] = state[WAY + c] = 0.0
     bb = max(bb, state[SPEED]) if anew else bb - gain * pb
     state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2] = share * r, (1.0 - share) * pb, bb
-    state[SURE] = trust * r
-    state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, COUNTS) - 1.0)), 1.0)
+    state[SURE_UNTIL] = trust * r
+    state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, MAX_Q) - 1.0)), 1.0)
     state[LASTS] += time
     state[PATH] += time * math.sqrt(speed2)
-    more = 0.5 * (min(believed, COUNTS) - min(square, COUNTS)) + math.log(wide / s)
-    too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > RATE**2
-    state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MOST)
+    more = 0.5 * (min(believed, MAX_Q) - min(square, MAX_Q)) + math.log(wide / s)
+    too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > ERRS_RATE**2
+    state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MAX_EVIDENCE)
     if state[EVIDENCE] == 0.0:
         state[FAILS] = state[PATH] = state[LASTS] = 0.0
         state[BEFORE], state[BEFORE + 1] = state[PLACE], state[PLACE + 1]

@@ -13,7 +13,7 @@ from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from .track import Method
 
-SHORTEST, WITHHELD = 20, 5.0
+MIN_STEPS, WITHHELD_SECONDS = 20, 5.0
 """Steps of a stretch that calibrates, at least; s of fixes, three at least, that are kept from the filter, and then as
 long given to it."""
 FITTED, BLOCKS = 2 / 3, 8
@@ -56,8 +56,8 @@ def calibrated(
         make: the method by its numbers.
         usual: by name, > 0.
         recording: of a drive, or of the first part of one.
-        truth: of the same vehicles and times, NaN where there is none; without one fixes of every other WITHHELD s are
-            kept from the filter, and stand for it.
+        truth: of the same vehicles and times, NaN where there is none; without one fixes of every other
+            WITHHELD_SECONDS s are kept from the filter, and stand for it.
 
     Raises:
         InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
@@ -71,7 +71,7 @@ def calibrated(
     )
     rest = [part for part in whole if np.isfinite(part.target[:, part.recording.t >= checked.t[split]]).any()]
     if not first or not rest:
-        allowed = f"must hold {SHORTEST} steps of a vehicle without a break, with a target, in all of its thirds"
+        allowed = f"must hold {MIN_STEPS} steps of a vehicle without a break, with a target, in all of its thirds"
         raise InputError("recording", repr(checked), allowed, "Give a longer part of the drive.")
     change, by = held_out(make(fit(make, usual, first)), default, rest, checked.t[split])
     text = f"the error on its last third by {change:.2g} +- {by:.2g} m"
@@ -93,13 +93,15 @@ def parts_of(recording: Recording, truth: Fleet | None) -> list[Part]:
     """The stretches of all vehicles that have targets."""
     parts = []
     for column in recording.observers:
-        for start, stop in recording.stretches(column, SHORTEST):
+        for start, stop in recording.stretches(column, MIN_STEPS):
             part, variance = recording.between(start, stop), np.zeros(2)
             if truth is None:
                 target, variance = part.gnss[:, :, column], np.square(recording.sensors.gnss_std[:2])
                 fixed = part.t[np.isfinite(target[0, :, 0])]
                 often = float(np.median(np.diff(fixed))) if len(fixed) > 1 else 0.0
-                held = (part.t - part.t[0]) / min(max(WITHHELD, 3 * often), (part.t[-1] - part.t[0]) / 4) % 2 >= 1
+                held = (part.t - part.t[0]) / min(
+                    max(WITHHELD_SECONDS, 3 * often), (part.t[-1] - part.t[0]) / 4
+                ) % 2 >= 1
                 target = np.where(held[:, None], target, np.nan)
                 part = replace(part, gnss=np.where(held[:, None, None], np.nan, part.gnss))
             else:

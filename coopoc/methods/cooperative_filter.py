@@ -35,12 +35,12 @@ FOUND = {
     "alone": "of the steps, as what is measured of its neighbours contradicts its fixes",
 }
 LEVELS = ("range", "azimuth", "inclination", "fix", "message", "motion")
-NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.01, 0.0)
+NOTED_ERRORS = (0.01, 0.01, 0.01, 0.1, 0.01, 0.01, 0.0)
 """Least of what is found that is worth a note."""
-LOUD = 1.5
+NOTED_LEVEL = 1.5
 """Level that is worth a note, or less than its inverse."""
-KINDS = ("range", "azimuth", "inclination", "message", "trusted")
-LATE = 0.1
+WEIGHED = ("range", "azimuth", "inclination", "message", "trusted")
+NOTED_CLOCK = 0.1
 """s, of a clock that is worth a note: in 120 worlds with nothing wrong at most 0.08 s was found."""
 
 
@@ -230,7 +230,7 @@ class CooperativeFilter(Checked):
             of_ego, by_link = run_filter(inputs, assumed, sent, odometry, model)
             fixes, deviations, x, cov = np.split(of_ego, [1, -12, -9], axis=-1)
             neighbours, weights = by_link[..., :3], by_link[..., 3:]
-            extras = {"fix": fixes} | {kind: weights[..., k] for k, kind in enumerate((*KINDS, "clock"))}
+            extras = {"fix": fixes} | {kind: weights[..., k] for k, kind in enumerate((*WEIGHED, "clock"))}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
@@ -239,16 +239,16 @@ class CooperativeFilter(Checked):
             notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
-            shares = weights[..., : len(KINDS)]
+            shares = weights[..., : len(WEIGHED)]
             low, measured = (shares < 0.1).sum(axis=0), np.isfinite(shares).sum(axis=0)
             for j in np.unique(inputs.neighbour):
                 here = inputs.neighbour == j
-                clock = weights[:, here, len(KINDS)]
+                clock = weights[:, here, len(WEIGHED)]
                 ahead = float(np.median(clock[np.isfinite(clock)])) if np.isfinite(clock).any() else 0.0
-                if abs(ahead) > LATE:
+                if abs(ahead) > NOTED_CLOCK:
                     way = "ahead, or its messages are late" if ahead > 0 else "behind"
                     notes.append(f"clock, {recording.ids[j]}: {abs(ahead):.2g} s {way}")
-                for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
+                for kind, count, of in zip(WEIGHED, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
                     what = f"{kind}, {own_id} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(x, cov.reshape(*x.shape, 3), neighbours, extras=extras)
@@ -308,7 +308,7 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     usual[5:7] = np.nanmean(found[..., 5:7], axis=(0, 1))
     usual[len(FOUND) :][(late[..., len(FOUND) :] == 1.0).all(axis=(0, 1))] = np.nan
     usual[10:12] *= fix
-    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0, 0.0))
+    least = np.maximum(NOTED_ERRORS, (0.0, 0.0, *stated, 0.0, 0.0, 0.0))
     notes = [
         f"{name}, {ego}: {value:.2g} {unit}".rstrip()
         for (name, unit), value, most in zip(FOUND.items(), usual, least, strict=False)
@@ -318,7 +318,7 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     return notes + [
         f"{kind} level, {ego}: {value:.2g} times the stated deviation"
         for kind, value in levels
-        if value > LOUD or (value < 1 / LOUD and (fix == 1.0 or kind in ("fix", "message")))
+        if value > NOTED_LEVEL or (value < 1 / NOTED_LEVEL and (fix == 1.0 or kind in ("fix", "message")))
     ]
 
 

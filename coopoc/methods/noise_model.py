@@ -179,7 +179,7 @@ class NoiseModel:
 FINEST = 1e-5
 """Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
 beside 1 leaves the fixes six of double precision's sixteen digits."""
-FAR = 30.0
+COARSE_DISTANCE = 30.0
 """m, distance at which an angle is coarse."""
 SAMPLED = 2000
 """Measurements whose median distance counts for a recording's."""
@@ -269,7 +269,10 @@ def _resolvable(noise_model: NoiseModel) -> NoiseModel:
     floor."""
     if noise_model.sensors is None:
         return noise_model
-    fix, coarse = max(noise_model.gnss_std), max(noise_model.sensors.relative_std * np.array([1.0, FAR, FAR]))
+    fix, coarse = (
+        max(noise_model.gnss_std),
+        max(noise_model.sensors.relative_std * np.array([1.0, COARSE_DISTANCE, COARSE_DISTANCE])),
+    )
     least = max(FINEST * fix, float(np.sqrt(UNEVEN * fix * min(fix, coarse))))
     if min(noise_model.sensors.relative_std) >= least:
         return noise_model

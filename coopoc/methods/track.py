@@ -161,11 +161,11 @@ def of_recording(track: Track, recording: Recording) -> None:
         raise InputError("track", f"{len(track.x)} runs", f"must have {recording.runs}", "Take recording.of_runs(...).")
 
 
-FAR = 100.0
+LOST_STDS = 100.0
 """Standard deviations (norm of that of the fixes) between an estimate and a fix, beyond which a method is lost."""
 
 
-def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> Bools:
+def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: float = LOST_STDS) -> Bools:
     """(R, E) whether estimates (R, T, E, 3) m are ever farther from a fix than `limit` standard deviations."""
     gap = recording.gnss.take(columns, axis=2)
     gap -= x

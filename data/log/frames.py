@@ -57,10 +57,10 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
         summary.assume(
             f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set; rows are in their order"
         )
-    t = np.unique(rows["t"].dropna())
-    leap = np.flatnonzero(np.abs(np.diff(t) - HOUR) < HOUR / 60)
+    times = np.unique(rows["t"].dropna())
+    leap = np.flatnonzero(np.abs(np.diff(times) - HOUR) < HOUR / 60)
     if len(leap) == 1:
-        summary.assume(f"stamps of all leap by an hour from {t[leap[0]]:.10g} s on, as local time does: give UTC")
+        summary.assume(f"stamps of all leap by an hour from {times[leap[0]]:.10g} s on, as local time does: give UTC")
     return rows
 
 

@@ -20,25 +20,25 @@ from coopoc.kernels.stars.cooperative_members import CHANGES, CONTRADICTED, WIDE
 from coopoc.kernels.stars.cooperative_messages import (
     CLIP,
     FADES,
+    FAULTY_SHARE,
     FIX_SCORE,
     PENALTY,
-    REVOKE,
-    SHARE,
-    SURE,
+    REVOKE_LOG_ODDS,
+    TRUST_LOG_ODDS,
     WINDOW,
 )
-from coopoc.kernels.stars.cooperative_state import ACCELERATION, ESTABLISHED, LONGEST, TAU, WILD
+from coopoc.kernels.stars.cooperative_state import ACCELERATION, ESTABLISHED, MAX_LOCKOUT, TAU, WILD
 from coopoc.kernels.stars.otherwise import (
     AGREEING,
-    FASTEST,
     KNOWN,
-    LASTS,
-    LATE,
-    LOUDEST,
+    MAX_LEVEL,
+    MAX_LEVEL_CHANGE,
+    MIN_LEVEL,
     PRIOR,
-    QUIETEST,
-    RARE,
     SIDEWAYS,
+    SLIP_INTERVAL,
+    SLIP_LASTS,
+    SPEED_MEMORY,
     SUDDEN,
     TURNS,
     UNSEEN,
@@ -332,7 +332,7 @@ class Oracle:
     def pace(self, t: int) -> None:
         """The most of late speeds, and its direction."""
         dt, u = self.seen.dt, self.seen.velocity[self.run, t, self.ego]
-        speed, late = float(np.linalg.norm(u)), self.state["speed"] * math.exp(-dt / LATE)
+        speed, late = float(np.linalg.norm(u)), self.state["speed"] * math.exp(-dt / SPEED_MEMORY)
         self.state["blind"] += dt
         if speed > 0.5 * late:
             self.state |= {"course": u / speed, "blind": 0.0}
@@ -352,14 +352,16 @@ class Oracle:
             fails or known or not self.state["jumped"]
         )
         if before is None or not strange:
-            self.state["slips"] *= 0.0 if n else math.exp(-dt / LASTS)
+            self.state["slips"] *= 0.0 if n else math.exp(-dt / SLIP_LASTS)
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
         rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white + self.state["shown"] ** 2
         self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
         self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         self.corrected_now = False
-        prior = p * (1.0 if known else math.exp(-dt / LASTS)) + (1 - p) * min(dt / (LASTS if known else RARE), 0.5)
+        prior = p * (1.0 if known else math.exp(-dt / SLIP_LASTS)) + (1 - p) * min(
+            dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5
+        )
         odds = self.state["score"] - first[0]["score"] + (DECISIVE if fails else math.log(prior / (1 - prior)))
         if odds < 0:
             self.state, self.revoked = first
@@ -493,8 +495,8 @@ class Oracle:
             self.trust()
         self.corrected()
         if g.forget:
-            step = np.clip(s["learned"] / (s["information"] + PRIOR), -FASTEST, FASTEST)
-            s["level"] = np.clip(s["level"] + step, QUIETEST, LOUDEST)
+            step = np.clip(s["learned"] / (s["information"] + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
+            s["level"] = np.clip(s["level"] + step, MIN_LEVEL, MAX_LEVEL)
         s["learned"] = np.zeros(6)
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
@@ -565,7 +567,7 @@ class Oracle:
         square = gap @ gap
         wild = kind == 3 and square > SUDDEN * total
         s = self.state
-        displaced = wild and (s["agreed"] < ESTABLISHED or s["locked"].get(self.ego, 0.0) < LONGEST)
+        displaced = wild and (s["agreed"] < ESTABLISHED or s["locked"].get(self.ego, 0.0) < MAX_LOCKOUT)
         more = min((np.square(gap - s["gap"]).sum() / 2 if displaced else square) / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
         if kind == 3 and not wild:
@@ -614,7 +616,7 @@ class Oracle:
                 share = g.fix_gate / q if q < HARD_REJECT_FACTOR * g.fix_gate else 0.0
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
             if not judged and s["agreed"] >= ESTABLISHED:
-                locked[j] = min(locked[j], LONGEST)
+                locked[j] = min(locked[j], MAX_LOCKOUT)
         if share:
             b.updates(h, z, r, share=share)
         return share
@@ -637,10 +639,10 @@ class Oracle:
         mean = mean + (gap * min(1.0, math.sqrt(CLIP / q)) - mean) / count
         s["mean"][j] = count, mean
         v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
-        odds = math.log((1 - SHARE) / SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
+        odds = math.log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
         near = mean @ np.linalg.solve(v, mean)
-        enough = near >= 2 * (math.log((1 - SHARE) / SHARE) + REVOKE)
-        return bool(count >= 3 and enough and odds < -REVOKE)
+        enough = near >= 2 * (math.log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
+        return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
 
     def doubt(self, j: int) -> None:
         s = self.state
@@ -968,13 +970,13 @@ class Oracle:
                     continue
                 at = b.at(("b", j))
                 x, p = b.x[at], b.p[at, at]
-                odds[j] = math.log((1 - SHARE) / SHARE) - PENALTY * self.revoked.get(j, 0)
+                odds[j] = math.log((1 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * self.revoked.get(j, 0)
                 if own:
                     odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * math.log(2 * math.pi * wide / own * narrow)
                 else:
                     odds[j] += normal(x, p) - normal(0 * x, TAU**2 * np.eye(3))
             best = max(odds, key=lambda j: (odds[j], -s["slot"][j]), default=-1)
-            if best < 0 or odds[best] <= SURE:
+            if best < 0 or odds[best] <= TRUST_LOG_ODDS:
                 return
             s["trusted"].add(best)
             s["mean"].pop(best, None)

@@ -65,7 +65,7 @@ def storage(function: Function) -> Function:
 
 USUAL_SECONDS: dict[str, float] = json.loads((Path(__file__).parent / "usual_seconds.json").read_text())
 """CPU seconds that a kernel took to compile where `benchmarks/compile.py` was run, of those above a second."""
-PATIENCE = 2.0
+QUIET_SECONDS = 2.0
 """s of compiling after which a line on stderr reports it."""
 PLAIN = "COOPOC_PLAIN_NJIT"
 """Environment variable: 1 compiles by numba's public interface alone."""
@@ -89,7 +89,7 @@ def _hooks() -> Any:
 
 @cache
 def _watch() -> None:
-    """While a kernel compiles collect no garbage, which a tenth of the time would go to; report it after PATIENCE."""
+    """Collect no garbage while a kernel compiles, a tenth of the time, and report it after QUIET_SECONDS."""
     from numba.core import event
 
     class Watcher(event.Listener):
@@ -98,7 +98,7 @@ def _watch() -> None:
         began = used = 0.0
 
         def on_start(self, event: Any) -> None:
-            self.timers.append(threading.Timer(PATIENCE, _say, [_line(event.data["dispatcher"].py_func)]))
+            self.timers.append(threading.Timer(QUIET_SECONDS, _say, [_line(event.data["dispatcher"].py_func)]))
             if len(self.timers) == 1:
                 self.began, self.used = clock(), time.process_time()
                 self.timers[0].daemon = True
@@ -123,10 +123,10 @@ def _name(function: Any) -> str:
 
 
 def _line(function: Any) -> str:
-    """What is said of a kernel that compiles for more than PATIENCE."""
+    """What is said of a kernel that compiles for more than QUIET_SECONDS."""
     usual = USUAL_SECONDS.get(_name(function), 0.0)
     title = function.__module__.rpartition(".")[2].replace("_", " ")
-    often = f", usually {usual:.0f} s on an idle core" if usual > PATIENCE else ""
+    often = f", usually {usual:.0f} s on an idle core" if usual > QUIET_SECONDS else ""
     return f"compiling the {title} kernel, once per machine{often}"
 
 

@@ -24,9 +24,9 @@ UNPLACED = 7
 """Bits of all components: nothing is known of the position of one of the two."""
 JOINT, NAIVE, INTERSECTION = range(3)
 """How estimates are fused: in one state, as if their errors were independent, by covariance intersection."""
-TRIED = 10
+WEIGHTS_TRIED = 10
 """Weights that covariance intersection tries."""
-LEAST = 1e-9
+MIN_WEIGHT = 1e-9
 
 
 class PoseMeasurements(NamedTuple):
@@ -208,14 +208,14 @@ def fuse_pair(
     """
     d, observer, other = options.d, options.d * measured.ends[k, 0], options.d * measured.ends[k, 1]
     ends = (ZERO, d if other >= 0 else ALONE)
-    tries = TRIED if options.fusion == INTERSECTION and other >= 0 else 0
+    tries = WEIGHTS_TRIED if options.fusion == INTERSECTION and other >= 0 else 0
     best, chosen = math.inf, 1.0
     for attempt in range(tries + 1):
-        weight = chosen if attempt == tries else (attempt + 1.0) / TRIED
+        weight = chosen if attempt == tries else (attempt + 1.0) / WEIGHTS_TRIED
         pair.cov[:], pair.hits[:] = 0.0, 0.0
         set_member(pair, 0, poses, observer, d, weight)
         if other >= 0:
-            set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)
+            set_member(pair, d, poses, other, d, max(1.0 - weight, MIN_WEIGHT) if tries > 0 else 1.0)
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
         add_relative(measured, noise, pair, ends, run, k, ZERO)

@@ -24,7 +24,7 @@ OFFSET = 6
 """Index of the offset of its ranges."""
 ROWS = 4
 """Rows that may be pending, so that one pass over the covariance serves them all."""
-NEAREST = 1e-3
+MIN_ANGLE_DISTANCE = 1e-3
 """m, least distance at which an angle is linearised."""
 Ends = tuple[int, int]
 """First number of the member and of the other, -1 for none."""
@@ -147,7 +147,8 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
         total += e * columns[q, k + OFFSET]
     if o >= 0:
         total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
-    return total
+    answer: float = total
+    return answer
 
 
 @part
@@ -211,11 +212,11 @@ def relative_row(polar: Numbers, heading: float, component: int, measured: float
         measured: m or rad.
         longer: 1 where the offset of ranges is a state, else 0.
     """
-    (ray, side, up), d = axes(polar), max(polar[0], NEAREST)
+    (ray, side, up), d = axes(polar), max(polar[0], MIN_ANGLE_DISTANCE)
     if component == 0:
         return measured - d, (-ray[0], -ray[1], -ray[2], 0.0, longer)
     if component == 1:
-        flat = max(d * polar[3], NEAREST)
+        flat = max(d * polar[3], MIN_ANGLE_DISTANCE)
         residual = wrapped(measured - math.atan2(polar[1], polar[2]) + heading)
         return residual, (-side[0] / flat, -side[1] / flat, 0.0, -1.0, 0.0)
     return wrapped(measured - math.atan2(polar[3], polar[4])), (-up[0] / d, -up[1] / d, -up[2] / d, 0.0, 0.0)

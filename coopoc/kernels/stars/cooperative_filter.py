@@ -107,7 +107,6 @@ from .otherwise import (
     EXCESS,
     FIRST_ALONE,
     KNOWN,
-    LASTS,
     LEAST_COUNTED,
     LIKELY,
     LOUDEST_NOISE,
@@ -116,6 +115,7 @@ from .otherwise import (
     NOW,
     NUMBERS,
     PENDING,
+    SLIP_LASTS,
     SLIPPED,
     SQUARES,
     Tries,
@@ -222,7 +222,8 @@ def gather(
             rows[i, SOLO + c] = sent[who[i], run, when, c]
         for c in range(3):
             rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
-    return count
+    answer: int = count
+    return answer
 
 
 @inner
@@ -276,7 +277,7 @@ def step(
     elif f.ego[NUMBERS] > 0.0:
         f.ego[SLIPPED] = 0.0
     else:
-        f.ego[SLIPPED] *= math.exp(-own[DT] / LASTS)
+        f.ego[SLIPPED] *= math.exp(-own[DT] / SLIP_LASTS)
     remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:

@@ -24,7 +24,7 @@ from .cooperative_state import (
     LAST,
     LEVEL,
     LOCKED,
-    LONGEST,
+    MAX_LOCKOUT,
     MEAN,
     MESSAGES,
     NO_POSITION,
@@ -82,9 +82,9 @@ CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 FIX_SCORE = 16.0
 """Most of a squared Mahalanobis distance of a fix that tells of a slip."""
-SHARE = 0.1
+FAULTY_SHARE = 0.1
 """Prior share of vehicles whose receiver errs: of 0.05 to 0.3 no world is told apart."""
-SURE, PENALTY, REVOKE = 2.0, 4.0, 2.0
+TRUST_LOG_ODDS, PENALTY, REVOKE_LOG_ODDS = 2.0, 4.0, 2.0
 """Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
 WINDOW = 30.0
 """Fixes in the mean innovation of a vehicle."""
@@ -229,7 +229,8 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
-    return age > ROUNDING
+    answer: bool = age > ROUNDING
+    return answer
 
 
 @inner
@@ -274,7 +275,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
         if not judged and f.ego[AGREED] >= ESTABLISHED:
-            f.member[0, LOCKED] = min(f.member[0, LOCKED], LONGEST)
+            f.member[0, LOCKED] = min(f.member[0, LOCKED], MAX_LOCKOUT)
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
     return share
@@ -313,13 +314,13 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     mean, (p, q, r) = vector_at(status, MEAN // 3), vector_at(h.three, VARIANCE // 3)
     more = 1.0 if model.own > 0.0 else 0.0
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
-    odds = math.log((1.0 - SHARE) / SHARE)
+    odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE)
     near, narrow = distance(s, mean)
-    if count < 3.0 or near < 2.0 * (odds + REVOKE):
+    if count < 3.0 or near < 2.0 * (odds + REVOKE_LOG_ODDS):
         return False
     tau2 = TAU**2
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
-    return odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE
+    return odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE_LOG_ODDS
 
 
 @part
@@ -334,7 +335,7 @@ def trust(f: Filter, model: Model) -> None:
         narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
         unit = wide / model.own * narrow
     while True:
-        best, most = ABSENT, SURE
+        best, most = ABSENT, TRUST_LOG_ODDS
         for k in range(len(f.who)):
             j = f.who[k, VEHICLE]
             if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
@@ -344,7 +345,7 @@ def trust(f: Filter, model: Model) -> None:
                 for d in range(3):
                     h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
             q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
-            odds = math.log((1.0 - SHARE) / SHARE) - PENALTY * f.status[j, REVOKED]
+            odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * f.status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most = k, odds

@@ -48,7 +48,7 @@ NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 WILD = 32.0
 """Squared normalised distance from which a velocity is implausible, or an error of fixes beyond doubt."""
-ESTABLISHED, LONGEST = 60.0, 0.99 * PATIENCE
+ESTABLISHED, MAX_LOCKOUT = 60.0, 0.99 * PATIENCE
 """s of agreement with fixes after which a position was no wrong start, and its count of lock-out at which fixes that
 contradict it are taken for noisier ones: it is not left."""
 TAU = 20.0
@@ -318,7 +318,8 @@ def needs_restart(f: Filter, own: Floats) -> bool:
                 return False
             others, last = others + 1, k
     if f.status[ego, TRUSTED] > 0.0:
-        return f.who[0, HITS] > 0 and f.member[0, LOCKED] >= PATIENCE
+        answer: bool = f.who[0, HITS] > 0 and f.member[0, LOCKED] >= PATIENCE
+        return answer
     far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):
@@ -378,11 +379,13 @@ def seen_from(rows: Floats, row: int, c: int) -> float:
 def measured_vector(rows: Floats, row: int, c: int) -> float:
     """Component c of the measured vector to a neighbour, m."""
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    return d * ci if c == 2 else d * si * (ca if c == 0 else sa)
+    answer: float = d * ci if c == 2 else d * si * (ca if c == 0 else sa)
+    return answer
 
 
 @inside
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
     angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)
-    return rows[row, 0] >= 0.0 and angles
+    answer: bool = rows[row, 0] >= 0.0 and angles
+    return answer

@@ -145,7 +145,8 @@ def go_back(star: Star, gates: Gates, state: Floats, n: int) -> float:
     store(gates.before, 0, (*choose_each(begins, at, there), *kept, evidence, since))
     store(gates.state, 0, (*choose_each(back, spread, ego[:9]), *ego[9:12], choose(back, o, ego[12])))
     store(state, 0, choose_each(back, there, at))
-    return choose(left, o + ANEW, choose(back, o + BACK, o))
+    answer: float = choose(left, o + ANEW, choose(back, o + BACK, o))
+    return answer
 
 
 @inner
@@ -199,7 +200,8 @@ def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) ->
     q = distance(subtract(position_of(star, k), at), add_diagonal(cov, variance))
     store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
     gain: float = gain_of(cov, variance)
-    return choose(q - FIX_GATE, gain, -gain)
+    answer: float = choose(q - FIX_GATE, gain, -gain)
+    return answer
 
 
 @inner

@@ -100,7 +100,8 @@ def new_rows(members: int) -> Rows:
 @inside
 def lanes(g: Gaussian) -> int:
     """LANES of numbers that hold the vectors in use."""
-    return (3 * g.vectors[0] + LANES - 1) // LANES
+    answer: int = (3 * g.vectors[0] + LANES - 1) // LANES
+    return answer
 
 
 @inside
@@ -112,7 +113,8 @@ def three_rows(rows: Floats, i: int, wide: int) -> tuple[float, float, float]:
 @part
 def has(g: Gaussian, member: int, kind: int) -> bool:
     """Whether a vector is in the state."""
-    return g.block[member, kind] >= 0
+    answer: bool = g.block[member, kind] >= 0
+    return answer
 
 
 @part
@@ -121,7 +123,8 @@ def insert(g: Gaussian, member: int, kind: int) -> int:
     b = g.vectors[0]
     g.vectors[0] = b + 1
     g.block[member, kind], g.vectors[1 + b] = b, member * KINDS + kind
-    return 3 * b
+    answer: int = 3 * b
+    return answer
 
 
 @part

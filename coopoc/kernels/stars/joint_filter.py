@@ -208,7 +208,8 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     near = polar[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
     broadcast = choose_each(new, position_of(star, k), somewhere)
-    return choose_each(missing(polar), broadcast, measured)
+    answer: tuple[float, ...] = choose_each(missing(polar), broadcast, measured)
+    return answer
 
 
 @inner
@@ -228,7 +229,8 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
 def placed(joint: Joint, k: int, measured: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
-    return max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
+    answer: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
+    return answer
 
 
 @inner

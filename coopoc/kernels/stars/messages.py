@@ -128,25 +128,29 @@ def block_at(memory: Any, index: Any) -> Any:
 @inside
 def moved_of(star: Star, k: int) -> Numbers:
     """Motion m of member k since the last step."""
-    return vector_at(star.motion, 4 * k + MOVED)
+    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + MOVED)
+    return answer
 
 
 @inside
 def process_of(star: Star, k: int) -> Numbers:
     """Its variance m^2."""
-    return vector_at(star.motion, 4 * k + PROCESS)
+    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + PROCESS)
+    return answer
 
 
 @inside
 def position_of(star: Star, k: int) -> Numbers:
     """Position m of member k, as broadcast and brought forward."""
-    return vector_at(star.motion, 4 * k + POSITION)
+    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + POSITION)
+    return answer
 
 
 @inside
 def variance_of(star: Star, k: int) -> Numbers:
     """Its variance m^2."""
-    return vector_at(star.motion, 4 * k + VARIANCE)
+    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + VARIANCE)
+    return answer
 
 
 @inside
@@ -209,7 +213,8 @@ def gather(
                 std = model.relative_std if len(model.relative_std) else UNIT
                 put_lane(star.relative, 8 * k, lane, with_std(measurements.relative[run, link], std))
         interpret(star, model, k, measurements.dt)
-    return n
+    answer: int = n
+    return answer
 
 
 @inside

@@ -56,9 +56,9 @@ from .cooperative_state import (
     LEFT,
     LEVEL,
     LOCKED,
-    LONGEST,
     LOUDER,
     MADE,
+    MAX_LOCKOUT,
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
@@ -209,7 +209,8 @@ def clock_of(f: Filter, model: Model, k: int) -> float:
         return 0.0
     i = 3 * f.g.block[k, TURN] + 2
     m = f.g.x[i]
-    return m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2]))
+    answer: float = m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2]))
+    return answer
 
 
 @part
@@ -266,7 +267,7 @@ the logarithm of their likelihood, how many there are, and their squared normali
 fixes have jumped; for how long s it has not measured its direction, and that; and the innovation of the last fix m."""
 SIDEWAYS, TURNS = 0.03, 0.3
 """Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then."""
-LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
+SLIP_LASTS, SLIP_INTERVAL, SPEED_MEMORY, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 """s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
 
 
@@ -334,7 +335,7 @@ def remember_speed(f: Filter, own: Floats) -> None:
     square = 0.0
     for c in range(3):
         square += ((own[MOTION + c] + own[BY_FIXES + c]) / own[DT]) ** 2
-    speed, late = math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / LATE)
+    speed, late = math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY)
     f.ego[BLIND] += own[DT]
     if speed > 0.5 * late:
         f.ego[BLIND] = 0.0
@@ -405,7 +406,10 @@ def surprised(f: Filter, fails: bool) -> bool:
 def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> float:
     """Probability of a slip, after both tries of a step, by that before it, or by the evidence of an odometry that
     `fails`; once that is known, it does not end by itself."""
-    stays, begins = 1.0 if known else math.exp(-dt / LASTS), min(dt / (LASTS if known else RARE), 0.5)
+    stays, begins = (
+        1.0 if known else math.exp(-dt / SLIP_LASTS),
+        min(dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5),
+    )
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)
@@ -413,7 +417,7 @@ def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> flo
 
 SUDDEN, USUAL = 5.0, 0.95
 """Most of a squared normalised innovation that counts, and the mean of what counts of one number that is as assumed."""
-QUIETEST, LOUDEST, FASTEST = -2.0, 3.5, 0.5
+MIN_LEVEL, MAX_LEVEL, MAX_LEVEL_CHANGE = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
 PRIOR = 10.0
 """Information that the assumed level counts as: that of twenty numbers."""
@@ -461,7 +465,8 @@ def corrected(f: Filter) -> None:
 @part
 def ego_variance(f: Filter) -> float:
     """m^2, of the three axes together."""
-    return f.g.p[0, 0] + f.g.p[1, 1] + f.g.p[2, 2]
+    answer: float = f.g.p[0, 0] + f.g.p[1, 1] + f.g.p[2, 2]
+    return answer
 
 
 @part
@@ -481,7 +486,7 @@ def learn_fix(f: Filter, kind: int) -> None:
         r += h.three[VARIANCE + c]
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     wild = kind == FIXES and innovation2 > SUDDEN * s
-    displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < LONGEST)
+    displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < MAX_LOCKOUT)
     more = min((0.5 * change2 if displaced else innovation2) / s, SUDDEN) - 1.0
     learn(f, kind, more, r / s, 3.0)
     if kind == FIXES and not wild:  # what is wild says nothing of motion
@@ -504,7 +509,7 @@ def adapt(f: Filter, model: Model) -> None:
     keep = math.exp(-f.ego[SPAN] / model.forget)
     for kind in range(KINDS_OF_NUMBERS):
         change = f.ego[SLOPE + kind] / (f.ego[INFORMATION + kind] + PRIOR)
-        level = f.ego[LEVEL + kind] + min(max(change, -FASTEST), FASTEST)
-        f.ego[LEVEL + kind] = min(max(level, QUIETEST), LOUDEST)
+        level = f.ego[LEVEL + kind] + min(max(change, -MAX_LEVEL_CHANGE), MAX_LEVEL_CHANGE)
+        f.ego[LEVEL + kind] = min(max(level, MIN_LEVEL), MAX_LEVEL)
         f.ego[SLOPE + kind] = 0.0
         f.ego[INFORMATION + kind] *= keep

@@ -61,13 +61,13 @@ from .messages import (
     vector_at,
 )
 
-ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
-"""Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
-LEAST = 1e-9
+NEWTON_STEPS, BISECT_AFTER, STEP_TOLERANCE = 60, 20, 1e-8
+"""Of Newton's method; after BISECT_AFTER rounds a step out of the bracket halves it."""
+MIN_OWN_WEIGHT = 1e-9
 """Least weight of the ego's own estimate: at zero nothing might be left to invert."""
-MOST = 1.0 - 1e-6
+MAX_WEIGHT = 1.0 - 1e-6
 """Greatest weight but for 1: nearer to 1 the derivatives of what lacks a component, whose I is 1e8 m^2, bend within
-D / I = 1e-8, and Newton's steps there are shorter than TOLERANCE without a minimum."""
+D / I = 1e-8, and Newton's steps there are shorter than STEP_TOLERANCE without a minimum."""
 
 
 class Fusion(NamedTuple):
@@ -229,7 +229,8 @@ def trace(a: Numbers) -> float:
 @inside
 def own_cov(fusion: Fusion) -> Numbers:
     """Covariance m^2 of the ego's prediction."""
-    return add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
+    answer: tuple[float, ...] = add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
+    return answer
 
 
 @inside
@@ -261,21 +262,22 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
 @inner
 def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
-    """w of least trace in [LEAST, MOST], or 1."""
-    low, high, going = 0.0 * w + LEAST, 0.0 * w + MOST, 0.0 * w + 1.0
-    w = choose(w - MOST, high, w)
-    for round_ in range(ROUNDS):
+    """w of least trace in [MIN_OWN_WEIGHT, MAX_WEIGHT], or 1."""
+    low, high, going = 0.0 * w + MIN_OWN_WEIGHT, 0.0 * w + MAX_WEIGHT, 0.0 * w + 1.0
+    w = choose(w - MAX_WEIGHT, high, w)
+    for round_ in range(NEWTON_STEPS):
         first, second = derivatives(fusion, fixed, n, w)
         low, high = choose(first, low, w), choose(-first, high, w)
         newton = choose(second, w - first / second, w)
         inside_low, inside_high = newton - low, high - newton
         middle = 0.5 * (low + high)
-        below, above = (low, high) if round_ < BISECT else (middle, middle)
+        below, above = (low, high) if round_ < BISECT_AFTER else (middle, middle)
         before, w = w, choose(going, choose(inside_low, choose(inside_high, newton, above), below), w)
-        going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
+        going = choose(abs(w - before) - STEP_TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    return choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
+    answer: float = choose(w - MAX_WEIGHT + STEP_TOLERANCE, 0.0 * w + 1.0, w)
+    return answer
 
 
 @inner
@@ -295,7 +297,8 @@ def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float
 @inside
 def product(a: Numbers, b: Numbers) -> Numbers:
     """A B."""
-    return negate(minus_product(a, b))
+    answer: tuple[float, ...] = negate(minus_product(a, b))
+    return answer
 
 
 @inside
