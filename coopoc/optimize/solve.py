@@ -170,7 +170,7 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
         if item.measurement.compares_poses:
             what, hint = f"{pair} half a turn from what is measured", "Give an x0 that is turned less."
         else:
-            what, hint = f"{pair} coincide or stand above each other", "Give an x0 that keeps them apart."
+            what, hint = f"{pair} coincide, or differ in height alone", "Give an x0 that keeps them apart."
         raise InputError("x0", what, f"leaves {item.kind} without a direction", hint)
     return start, placed
 

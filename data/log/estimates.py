@@ -202,9 +202,7 @@ def odometry(c: Check, column: int) -> Estimate:
             return none
         value[:2], value[2] = _polar(1 / turned), -value[2]
         error[:2] = np.hypot(error[:2], attenuation) / abs(turned) ** 2
-        if abs(value[2]) > max(
-            BEHIND, SURE_ERRORS * error[2]
-        ):  # smoothed fixes cut bends: speeds and directions seem wrong
+        if abs(value[2]) > max(BEHIND, SURE_ERRORS * error[2]):  # smoothed fixes cut bends: all else seems wrong
             error[[0, 1, 3, 4]] = np.inf
         return Estimate(value, error)
     path = plane(truth.position[:, column])

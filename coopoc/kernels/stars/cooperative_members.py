@@ -92,7 +92,8 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
 
 @part
 def dismiss(f: Filter, model: Model, k: int, doubted: bool) -> None:
-    """Remove a member; if it is still measured, what was found of its fixes, beside a wrong position, is forgotten."""
+    """Remove a member; if it is still measured, the error that its fixes seemed to have beside a wrong position is
+    forgotten."""
     j = f.who[k, VEHICLE]
     if f.who[k, INPUT] >= 0 and (doubted or f.status[j, TRUSTED] == 0.0):
         set_trust(f, j, 0.0, TAU**2 + model.own)
