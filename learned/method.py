@@ -1,6 +1,7 @@
 """LearnedGain: a trained net as a method, Recording -> Track."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,13 +13,15 @@ from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.methods.doubts import doubts
 from coopoc.methods.gaps import in_stretches
-from coopoc.methods.stream import Stream
 from coopoc.methods.track import Alone, Track, silent_track
 from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
-from .stream import GainState, SoloGain, StepByStep
+from .stream import GainStream
 from .training.machine import one_core
+
+if TYPE_CHECKING:
+    from .nets.gain import Recurrent
 
 SIZE = 3
 """Components of a position."""
@@ -44,7 +47,7 @@ class LearnedGain(Alone):
     0
     """
 
-    model: StepByStep
+    model: "Recurrent"
     name: str = "fedkalmannet"
     x0: Floats | None = None
 
@@ -55,7 +58,7 @@ class LearnedGain(Alone):
         if not callable(self.model) or not callable(getattr(self.model, "start", None)):
             raise InputError("model", shown(self.model), "must be a net with start and step", "Give GainNet().")
 
-    def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[GainState]:
+    def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> GainStream:
         """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.
 
         Args:
@@ -66,7 +69,7 @@ class LearnedGain(Alone):
         >>> LearnedGain(GainNet(2, 1)).start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
         (array([1., 2., 0.]), None)
         """
-        return Stream(SoloGain(self.model), x0, history)
+        return GainStream(self.model, x0, history)
 
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:

@@ -1,74 +1,55 @@
-"""A net that filters step by step, as a `Solo`: one step at a time, near its own origin."""
+"""GainStream: a net that filters step by step, near its own origin."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import torch
-from torch import Tensor, nn
 
 from coopoc.arrays import Floats
+from coopoc.methods.motion_history import MotionHistory, three
 
 from .training.machine import one_core
 
-
-class StepByStep(Protocol):
-    """Protocol of a net for `LearnedGain`; `nets.gain.Recurrent` satisfies it."""
-
-    positions: tuple[str, ...]
-
-    def start(self, x0: Tensor) -> Any:
-        """The memory before the first step at x0 (B, 3) m: a NamedTuple whose field `x` is the estimate."""
-
-    def step(self, memory: Any, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Any, Tensor]:
-        """The memory after a step, and the gain (B, 3, 3)."""
-
-    def parameters(self) -> Iterator[nn.Parameter]:
-        """The weights."""
-
-    def __call__(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """The estimates (B, T, 3) m."""
+if TYPE_CHECKING:
+    from .nets.gain import Recurrent
 
 
-class GainState(NamedTuple):
-    """The state of a streamed net: origin (3,) m of its memory's positions, memory (one lane), last gain (3, 3)."""
+class GainStream:
+    """A net, step by step: `step` takes the new measurements and returns the estimate.
 
-    origin: Floats
-    memory: Any
-    gain: Floats
+    The origin of the net's positions moves along with the estimate: float32 is as accurate after a day as after a step.
 
-
-@dataclass(frozen=True, eq=False)
-class SoloGain:
-    """A net as a `Solo`. It has no covariance, so the age of a fix changes nothing but the fix.
-
-    The origin moves along with the estimate: the net's float32 is as accurate after a day as after a step.
+    Args:
+        model: the net.
+        x0: (3,) m, a position known before the first step; None starts at the first fix.
+        history: s, how old a delayed fix may be.
     """
 
-    model: StepByStep
-
-    def begin(self, x: Floats, late: Floats | None) -> GainState:
-        """The net's first memory, at x."""
-        like = next(iter(self.model.parameters()))
-        return GainState(x, self.model.start(torch.zeros((1, 3), dtype=like.dtype)), np.full((3, 3), np.nan))
-
-    def process(self, velocity: Floats, dt: float) -> Floats:
-        """Zeros: the net has no process noise."""
-        return np.zeros(3)
+    def __init__(self, model: "Recurrent", x0: npt.ArrayLike | None, history: float) -> None:
+        self.history, self._model = MotionHistory(history), model
+        self._x: Floats = np.full(3, np.nan) if x0 is None else three("x0", x0)
+        self._memory = model.start(torch.zeros((1, 3), dtype=next(model.parameters()).dtype))
 
     @one_core()
-    def advance(self, state: GainState, moved: Floats, process: Floats, fix: Floats, late: Floats) -> GainState:
-        """`step` with the motion as a velocity over one second; a fix of NaN only predicts."""
-        kind = state.memory.x.dtype
-        near, step = (torch.as_tensor(a[None], dtype=kind) for a in (fix - state.origin, moved))
-        with torch.inference_mode():
-            memory, gain = self.model.step(state.memory, near, step, 1.0)
-            here = memory.x
-            positions = [name for name in self.model.positions if name in memory._fields]
-            memory = memory._replace(**{name: getattr(memory, name) - here for name in positions})
-        return GainState(state.origin + here[0].numpy(), memory, gain[0].numpy())
+    def step(
+        self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
+    ) -> tuple[Floats, None]:
+        """Position (3,) m, NaN before the first fix, as `FilterStream.step`; a net has no covariance.
 
-    def read(self, state: GainState) -> tuple[Floats, None]:
-        """The estimate."""
-        return state.origin, None
+        The net gets the motion as a velocity over one second; a fix of NaN only predicts.
+        """
+        self.history.check(gnss, velocity, dt, fix_age)
+        moved = dt * np.asarray(velocity, dtype=float)
+        self.history.push(dt, moved, np.zeros(3))
+        fix, _ = self.history.forward(gnss, fix_age)
+        if np.isnan(self._x).all():
+            self._x = fix
+            return fix, None
+        near, motion = (torch.as_tensor(a[None], dtype=self._memory.x.dtype) for a in (fix - self._x, moved))
+        with torch.inference_mode():
+            memory, _ = self._model.step(self._memory, near, motion, 1.0)
+            positions = [name for name in self._model.positions if name in memory._fields]
+            self._memory = memory._replace(**{name: getattr(memory, name) - memory.x for name in positions})
+        self._x = self._x + memory.x[0].numpy()
+        return self._x, None

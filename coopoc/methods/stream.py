@@ -1,7 +1,5 @@
 """Streaming: a solo filter that is fed one step at a time, with missing and delayed fixes and whatever dt there is."""
 
-from typing import Generic, Protocol, TypeVar
-
 import numpy as np
 import numpy.typing as npt
 
@@ -11,55 +9,6 @@ from ..kernels.motion import MotionNoise
 from ..kernels.odometry_fault import new_state
 from ..kernels.solo import STATE, FixNoise, stream_step
 from .motion_history import MotionHistory, three
-
-State = TypeVar("State")
-
-
-class Solo(Protocol[State]):
-    """A filter of one vehicle as pure functions of its state; arrays are (..., 3), runs and egos before the axes."""
-
-    def begin(self, x: Floats, late: Floats | None) -> State:
-        """State at a position x m that is known exactly (None), or at a first fix with `late` m^2 more than others."""
-
-    def process(self, velocity: Floats, dt: float) -> Floats:
-        """Variance m^2 of the motion dt u."""
-
-    def advance(self, state: State, moved: Floats, process: Floats, fix: Floats, late: Floats) -> State:
-        """One step: motion m, its variance m^2, fix m or NaN for none, variance m^2 that a late fix has more."""
-
-    def read(self, state: State) -> tuple[Floats, Floats | None]:
-        """Position (..., 3) m and covariance (..., 3, 3) m^2, or None if it claims none."""
-
-
-class Stream(Generic[State]):
-    """A solo filter of one's own, step by step: `step` takes the new measurements and returns the estimate.
-
-    Args:
-        solo: the filter.
-        x0: (3,) m, a position known before the first step; None starts at the first fix.
-        history: s, how old a delayed fix may be.
-    """
-
-    def __init__(self, solo: Solo[State], x0: npt.ArrayLike | None = None, history: float = 10.0) -> None:
-        self.solo, self.history = solo, MotionHistory(history)
-        self.state: State | None = None if x0 is None else solo.begin(three("x0", x0), None)
-
-    def step(
-        self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
-    ) -> tuple[Floats, Floats | None]:
-        """Position (3,) m and covariance (3, 3) m^2, as `FilterStream.step`; None if the filter claims none."""
-        self.history.check(gnss, velocity, dt, fix_age)
-        speed = np.asarray(velocity, dtype=float)
-        moved, process = dt * speed, self.solo.process(speed, dt)
-        self.history.push(dt, moved, process)
-        fix, late = self.history.forward(gnss, fix_age)
-        if self.state is not None:
-            self.state = self.solo.advance(self.state, moved, process, fix, late)
-        elif np.isfinite(fix).all():
-            self.state = self.solo.begin(fix, late)
-        else:
-            return np.full(3, np.nan), None
-        return self.solo.read(self.state)
 
 
 class FilterStream:
