@@ -132,9 +132,8 @@ def fitted(p: Params) -> NoiseModel:
 
 @lru_cache(maxsize=2)
 def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Any, ...]:
-    """Nets of all training seeds of a method under a condition, trained in one rollout."""
-    from coopoc.learned import GainNet
-    from coopoc.learned.federation.federate import Plan, federate_many
+    """Nets of all training seeds of a method under a condition."""
+    from coopoc.learned import GainNet, federate
     from coopoc.learned.federation.participation import Byzantine, Participation
 
     p = {**dict(given), "condition": condition, "method": method}
@@ -145,22 +144,22 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
     participation = Participation(share=0.5 if condition == "half absent" else 1.0)
     if condition == "poisoned update":
         participation = Byzantine(names=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
-    plan = Plan(int(p["rounds"]), method, int(p["local_epochs"]), participation=participation)
-    return tuple(fed.model for fed in federate_many(nets, groups, range(len(nets)), plan))
+    return tuple(
+        federate(net, group, int(p["rounds"]), method, int(p["local_epochs"]), seed, participation=participation).model
+        for seed, (net, group) in enumerate(zip(nets, groups, strict=True))
+    )
 
 
 def _pooled(p: Params, nets: list[Any], groups: "list[tuple[Client, ...]]") -> tuple[Any, ...]:
     """Nets trained on all pieces in one place."""
-    from coopoc.learned.training.clients import Segments
-    from coopoc.learned.training.fit import Task, fit_many
-    from coopoc.learned.training.schedule import Schedule
+    from coopoc.learned import Schedule, Segments, fit
 
-    tasks = []
+    made = []
     for seed, (net, group) in enumerate(zip(nets, groups, strict=True)):
         parts = ("training", "validation", "long")
         training, validation, long = (Segments.join([getattr(client, part) for client in group]) for part in parts)
-        tasks.append(Task(net, training, validation, seed, long=long))
-    return tuple(fit.model for fit in fit_many(tasks, Schedule(epochs=int(p["steps"]))))
+        made.append(fit(net, training, validation, Schedule(epochs=int(p["steps"])), seed, long=long).model)
+    return tuple(made)
 
 
 def cell(p: Params) -> list[Row]:

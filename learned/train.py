@@ -21,12 +21,12 @@ from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
-from .federation.federate import federate_many
+from .federation.federate import federate
 from .nets.gain import Gain
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
-from .training.fit import Task, fit_many
+from .training.fit import fit
 from .training.machine import LINE
 from .training.okf_fit import fit_okf
 
@@ -46,9 +46,8 @@ def train_all(
 ) -> dict[str, Checkpoint]:
     """Train every recipe in every setting, or read it from `out` where the same was trained before.
 
-    All settings of a recipe are trained together, on one core; recipes side by side on `jobs` cores. A checkpoint is
-    reused if its card's key, the hash of all that changes the weights, is the same; each is written whole or
-    not at all.
+    Recipes are trained side by side on `jobs` cores, each on one. A checkpoint is reused if its card's key, the hash of
+    all that changes the weights, is the same; each is written whole or not at all.
 
     Args:
         data: the clients' drives: a fleet, such as the bundled "town10-clients", whose measurements are simulated, or a
@@ -111,7 +110,7 @@ def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progres
 
 
 def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[Checkpoint]:
-    """Checkpoints of jobs of one recipe, trained together now."""
+    """Checkpoints of jobs of one recipe, trained now."""
     drawn = {job.setting: job_clients(job, fleet) for job in group}
     data = {job: _own(job, drawn[job.setting]) for job in group}
     models = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
@@ -179,26 +178,26 @@ def _joined(data: Sequence[Client], part: str) -> Segments:
     return Segments.join([getattr(c, part) for c in data])
 
 
-def _task(job: Job, data: Sequence[Client]) -> Task:
-    training, validation, long = (_joined(data, part) for part in ("training", "validation", "long"))
-    return Task(untrained(job), training, validation, job.setting.seed, str(job.client or ""), long)
-
-
 def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    nets, groups, seeds = [untrained(j) for j in todo], [data[j] for j in todo], [j.setting.seed for j in todo]
-    done = federate_many(nets, groups, seeds, todo[0].recipe.plan, stage)
-    parts = [[client.training for client in group] for group in groups]
-    return [Checkpoint(fed.model.calibrate(own), fed.card, fed.weights) for fed, own in zip(done, parts, strict=True)]
+    made, plan = [], todo[0].recipe.plan
+    for job in todo:
+        how = plan.rounds, plan.aggregate, plan.local_epochs, job.setting.seed, plan.schedule, stage
+        fed = federate(untrained(job), data[job], *how)
+        made.append(Checkpoint(fed.model.calibrate([c.training for c in data[job]]), fed.card, fed.weights))
+    return made
 
 
 def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     made = []
-    for fit in fit_many([_task(job, data[job]) for job in todo], todo[0].recipe.schedule, stage):
+    for job in todo:
+        training, validation, long = (_joined(data[job], part) for part in ("training", "validation", "long"))
+        how = job.recipe.schedule, job.setting.seed, stage, long, str(job.client or "")
+        done = fit(untrained(job), training, validation, *how)
         rows = [
-            {name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in fit.history
+            {name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in done.history
         ]
-        card = {"history": rows, "best": fit.best.step, "stopped": fit.stopped, "seconds": fit.seconds}
-        made.append(Checkpoint(fit.model, card, torch.stack([row.weights for row in fit.history])))
+        card = {"history": rows, "best": done.best.step, "stopped": done.stopped, "seconds": done.seconds}
+        made.append(Checkpoint(done.model, card, torch.stack([row.weights for row in done.history])))
     return made
 
 

@@ -18,7 +18,6 @@ from coopoc import Fleet, Sensors
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
-from coopoc.learned.federation.federate import Plan, federate_many
 from coopoc.learned.federation.history import Federation, Round, ledger
 from coopoc.learned.federation.participation import Byzantine, Participation
 from coopoc.learned.federation.rules import (
@@ -83,12 +82,9 @@ def trained(group: Sequence[Client], rounds: int = 3, model: Gain | None = None,
 def test_the_order_of_the_clients_changes_nothing(four, options):
     """Same seed, same weights, bit for bit, whatever the order of the clients."""
     one, other = trained(four, seed=3, **options), trained(four[::-1], seed=3, **options)
-    how: dict[str, Any] = {"rounds": 3, "local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options}
-    together = federate_many([Steady(), Steady()], [four[::-1], four], [8, 3], Plan(**how))[1]
-    for a, b, c in zip(one.history, other.history, together.history, strict=True):
+    for a, b in zip(one.history, other.history, strict=True):
         assert torch.equal(a.weights, b.weights)
-        assert torch.equal(a.weights, c.weights)
-        assert (a.sent, a.absent) == (b.sent, b.absent) == (c.sent, c.absent)
+        assert (a.sent, a.absent) == (b.sent, b.absent)
     assert not torch.equal(one.history[-1].weights, trained(four, seed=4, **options).history[-1].weights)
 
 

@@ -26,7 +26,7 @@ from test_learned_flower import in_process
 from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.learned import load
-from coopoc.learned.federation.local import local_fit
+from coopoc.learned.federation.local import adapt
 from coopoc.learned.flower.job import job_of
 from coopoc.learned.recipes import Job, job_clients, untrained
 
@@ -91,10 +91,8 @@ def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
     plan, found = job.recipe.plan, load(path)
     for row, theta, before in zip(found.card["history"][1:], found.history[1:], found.history[:-1], strict=True):
         own = [c for c in job_clients(job, fleet) if c.name not in row["absent"].keys() | row["rejected"].keys()]
-        fitted = [
-            local_fit(untrained(job), before, c, job.setting.seed, row["round"], plan.rounds, plan.local)[0].numpy()
-            for c in own
-        ]
+        trained = adapt(untrained(job), before, own, job.setting.seed, row["round"], plan.rounds, plan.local)
+        fitted = [made.weights.numpy() for made in trained.values()]
         sizes = [len(client.training) for client in own]
         mean = np.average(np.stack(fitted).astype(float), axis=0, weights=sizes)
         assert theta.numpy() == pytest.approx(mean, abs=1e-6)

@@ -13,7 +13,6 @@ from coopoc.learned import GainNet, Schedule, Segments, clients, federate, fit
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import mirrored
-from coopoc.learned.training.fit import Task, fit_many
 from coopoc.learned.training.schedule import cosine
 
 QUICK = Schedule(epochs=6, batch=2, checks=3)
@@ -106,7 +105,7 @@ def test_one_federated_client_is_local_training():
     """Law: federating one client for one round is `fit` on its pieces, bit for bit, and so is a uniform average."""
     (client,) = clients(drives((300,)), piece=10)
     schedule = replace(QUICK, epochs=2, epoch="pass", batch=4)
-    local = train.fit_many([Task(GainNet(), client.training, client.validation, 5, client.name)], schedule)[0]
+    local = fit(GainNet(), client.training, client.validation, schedule, 5, name=client.name)
     for rule in ("mean", "uniform"):
         fed = federate(GainNet(), [client], 1, rule, local_epochs=2, seed=5, schedule=schedule)
         assert torch.equal(fed.history[1].weights, local.history[-1].weights)
@@ -118,22 +117,6 @@ def test_same_seed_same_weights_and_another_seed_another_net():
     first, again, other = flatten(nets)
     assert torch.equal(first, again)
     assert not torch.allclose(first, other)
-
-
-def test_stacking_changes_no_net():
-    group = clients(drives(), piece=10)
-    tasks = [Task(GainNet(seed=s), c.training, c.validation, s) for s, c in enumerate(group)]
-    together = fit_many(tasks, QUICK)
-    for task, fitted in zip(tasks, together, strict=True):
-        alone = fit_many([task], QUICK)[0]
-        torch.testing.assert_close(flatten([alone.model]), flatten([fitted.model]), rtol=1e-5, atol=1e-6)
-
-
-def test_long_pieces_for_some_tasks_only_are_refused():
-    (client,) = clients(drives((300,)), piece=10)
-    tasks = [Task(GainNet(), client.training, client.validation, long=long) for long in (client.long, None)]
-    with refused("long = with 1 of 2 tasks"):
-        fit_many(tasks, QUICK)
 
 
 def test_training_lowers_the_loss_and_keeps_the_best_weights():
@@ -153,11 +136,10 @@ def test_a_pass_sees_every_piece_and_a_step_one_batch():
     assert all(len(set(row)) == 4 for row in Schedule(epochs=50, batch=4).plan(10, draw).tolist())
 
 
-def test_a_net_that_breaks_stops_with_a_reason_and_the_others_go_on():
+def test_a_net_that_breaks_stops_with_a_reason():
     (client,) = clients(drives((300,)), piece=10)
     broken = replace(client.training, gnss=client.training.gnss.clone().fill_(float("nan")))
-    tasks = [Task(GainNet(), t, client.validation) for t in (client.training, broken)]
-    good, bad = fit_many(tasks, QUICK)
+    good, bad = (fit(GainNet(), pieces, client.validation, QUICK) for pieces in (client.training, broken))
     assert good.stopped is None
     assert bad.stopped == "loss or gradient not finite at step 1"
     assert torch.equal(flatten([bad.model]), flatten([GainNet()]))

@@ -15,8 +15,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 import coopoc as co
-from coopoc.learned import GainNet, LearnedGain, clients, federate, ledger
-from coopoc.learned.training.fit import Task, fit_many
+from coopoc.learned import GainNet, LearnedGain, clients, federate, fit, ledger
 
 drives, fleet = co.load_fleet("town10-clients"), co.load_fleet("town10").between(0, 450)
 training, sensors = co.Sensors.paper_training(), co.Sensors.paper_scenario2()
@@ -35,8 +34,7 @@ for name, noise in (("training", training), ("scenario 2", sensors)):
 # %%
 group = clients(drives, training, seed=0)
 fed = federate(GainNet(), group, rounds=20, seed=0)
-tasks = [Task(GainNet(), one.training, one.validation, seed=0, long=one.long) for one in group]
-local = [done.model for done in fit_many(tasks)]
+local = [fit(GainNet(), one.training, one.validation, seed=0, long=one.long).model for one in group]
 once = ledger(fed).per_vehicle("training")
 print(f"{once / 1e6:.1f} MB per vehicle for the federation; 0 MB alone")
 

@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from torch import Tensor
+
 from coopoc.arrays import check_fields, instance, listed
 from coopoc.errors import InputError, shown
 from coopoc.plugins import find
@@ -13,11 +15,12 @@ from coopoc.plugins import find
 from ..nets.gain import Gain
 from ..nets.stack import flatten
 from ..training.clients import Client
+from ..training.fit import Judge
 from ..training.machine import one_core, watched
 from ..training.schedule import STEPS, Schedule
 from .combine import FLOAT32, SERVER, Answer, Standing, combine
 from .history import Federation, Round
-from .local import Group, Work, stacked
+from .local import adapt
 from .participation import Participation
 from .rules import Combine, Rule, rule
 
@@ -59,7 +62,17 @@ class Plan:
             actual, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
             raise InputError("aggregate", actual, allowed, "Ask more clients, or take the median.")
 
+    def tolerated(self, names: Sequence[str]) -> int:
+        """Number of Byzantine clients of a round that the rule withstands; a warning where more are simulated."""
+        self.check(len(names))
+        most = self.rule.tolerated(self.participation.count(len(names)))
+        if 0 < most < (hostile := len({*names} & {*getattr(self.participation, "names", ())})):
+            text = f"{hostile} Byzantine clients of {len(names)}: {self.rule.name} tolerates {most} a round"
+            warnings.warn(text, RuntimeWarning, stacklevel=4)
+        return most
 
+
+@one_core()
 def federate(
     model: str | Gain | type[Gain],
     clients: Sequence[Client],
@@ -108,87 +121,50 @@ def federate(
     start = chosen_net() if isinstance(chosen_net, type) else chosen_net
     if not isinstance(start, Gain):
         raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
-    plan = Plan(rounds, aggregate, local_epochs, schedule, participation)
-    return federate_many([start], [clients], [seed], plan, progress)[0]
+    began, plan = time.perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
+    names = _names(clients)
+    tolerated = plan.tolerated(names)
+    judge = Judge([[client.validation for client in clients], [client.long for client in clients]], start)
 
+    def validated(theta: Tensor) -> tuple[float, ...]:
+        return tuple(judge(theta.repeat(len(names), 1)).tolist())
 
-@one_core()
-def federate_many(
-    models: Sequence[Gain],
-    groups: Sequence[Sequence[Client]],
-    seeds: Sequence[int],
-    plan: Plan,
-    progress: str | None = None,
-) -> list[Federation]:
-    """`federate` for many independent federations in one rollout."""
-    began, local, chosen, presence = time.perf_counter(), plan.local, plan.rule, plan.participation
-    teams = [_group(group, seed) for group, seed in zip(groups, seeds, strict=True)]
-    for team in teams:
-        plan.check(len(team.names))
-        hostile = len({*team.names} & {*getattr(presence, "names", ())})
-        if 0 < (most := chosen.tolerated(presence.count(len(team.names)))) < hostile:
-            text = f"{hostile} Byzantine clients of {len(team.names)}: {chosen.name} tolerates {most} a round"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
-    stack = stacked(models[0], groups, teams)
-    standings = [Standing(theta) for theta in flatten(models)]
-    reports = stack.validated([s.theta for s in standings])
-    histories = [[Round(0, s.theta, (math.nan,) * len(r), r)] for s, r in zip(standings, reports, strict=True)]
+    standing = Standing(flatten([start])[0])
+    history = [Round(0, standing.theta, (math.nan,) * len(names), validated(standing.theta))]
     for number in watched(range(1, plan.rounds + 1), progress, "round"):
-        asked = [presence.asked(team.seed, number, team.names) for team in teams]
-        done = stack.adapted([s.theta for s in standings], asked, number, plan.rounds, local)
-        notes = []
-        for i, (team, work) in enumerate(zip(teams, done, strict=True)):
-            theta, sizes = standings[i].theta, dict(zip(team.names, team.sizes, strict=True))
-            answers = {
-                name: Answer(presence.answer(name, theta, weights), sizes[name])
-                for name, weights in work.weights.items()
-            }
-            standings[i], rejected, note = combine(chosen, standings[i], answers)
-            notes.append((rejected, note))
-        reports = stack.validated([s.theta for s in standings])
-        for history, *rest in zip(histories, teams, standings, asked, done, notes, reports, strict=True):
-            history.append(_row(history[-1], *rest))
-    seconds = (time.perf_counter() - began) / len(groups)
-    federations = []
-    for history, team in zip(histories, teams, strict=True):
-        most = chosen.tolerated(presence.count(len(team.names)))
-        federations.append(Federation(models[0], tuple(history), team.sizes, seconds, team.names, most))
-    return federations
+        asked = participation.asked(seed, number, names)
+        chosen = [client for client in clients if client.name in asked]
+        trained = adapt(start, standing.theta, chosen, seed, number, plan.rounds, plan.local)
+        answers = {
+            client.name: Answer(participation.answer(client.name, standing.theta, own.weights), len(client.training))
+            for client, own in zip(chosen, trained.values(), strict=True)
+            if not own.failure
+        }
+        standing, rejected, note = combine(plan.rule, standing, answers)
+        rejected = {name: own.failure for name, own in trained.items() if own.failure} | rejected
+        reports = zip(names, validated(standing.theta), history[-1].validation_loss, strict=True)
+        size = FLOAT32 * len(standing.theta)
+        row = Round(
+            number,
+            standing.theta,
+            tuple(trained[name].loss if name in trained else math.nan for name in names),
+            tuple(new if name in asked and name not in rejected else old for name, new, old in reports),
+            dict.fromkeys(answers, size + FLOAT32),
+            dict.fromkeys(trained, size),
+            rejected,
+            {name: "not asked" for name in names if name not in asked},
+            note,
+        )
+        history.append(row)
+    sizes, seconds = tuple(len(client.training) for client in clients), time.perf_counter() - began
+    return Federation(start, tuple(history), sizes, seconds, names, tolerated)
 
 
-def _group(clients: Sequence[Client], seed: int) -> Group:
+def _names(clients: Sequence[Client]) -> tuple[str, ...]:
     hint = "Give what learned.clients(...) returns."
     names = tuple(instance("clients", client, Client, hint).name for client in listed("clients", clients, hint))
     if not names:
         raise InputError("clients", "none", "must be at least one", hint)
     if len(set(names)) < len(names) or SERVER in names:
         raise InputError("clients", names, f"must have distinct names, none of them {SERVER!r}", "Rename the vehicles.")
-    return Group(names, tuple(len(client.training) for client in clients), seed)
-
-
-def _row(
-    before: Round,
-    team: Group,
-    standing: Standing,
-    asked: frozenset[str],
-    work: Work,
-    outcome: tuple[dict[str, str], str],
-    reports: Sequence[float],
-) -> Round:
-    """The next row of a history; a client whose answer does not count keeps its last validation loss."""
-    rejected, size = work.failed | outcome[0], FLOAT32 * len(standing.theta)
-    last = [
-        new if name in asked and name not in rejected else old
-        for name, new, old in zip(team.names, reports, before.validation_loss, strict=True)
-    ]
-    return Round(
-        before.number + 1,
-        standing.theta,
-        work.losses,
-        tuple(last),
-        dict.fromkeys(work.weights, size + FLOAT32),
-        {name: size for name in team.names if name in asked},
-        rejected,
-        {name: "not asked" for name in team.names if name not in asked},
-        outcome[1],
-    )
+    return names

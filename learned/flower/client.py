@@ -11,7 +11,7 @@ import torch
 
 from coopoc import InputError, MissingLibraryError, load_fleet, read_log
 
-from ..federation.local import local_fit
+from ..federation.local import adapt
 from ..recipes import Job, job_clients, untrained
 from ..training.clients import Client
 from ..training.drives import drives_of
@@ -40,7 +40,7 @@ def require_flower(needed_for: str) -> None:
 
 
 def client_app(source: "Source | None" = None) -> "ClientApp":
-    """The ClientApp of one vehicle: `local_fit` on its own drive, hence the weights that `federate` would give it.
+    """The ClientApp of one vehicle: `adapt` on its own drive, hence the weights that `federate` would give it.
 
     Any strategy of Flower's Message API can ask it: it reads "arrays" and "server-round", and answers with "arrays" and
     "metrics", weighted by "num-examples".
@@ -108,11 +108,11 @@ def answer(client: Client, job: Job, content: "RecordDict", training: bool) -> "
         return made
     number: Any = config["server-round"]
     plan = job.recipe.plan
-    weights, loss, failure = local_fit(model, theta, client, job.setting.seed, number, plan.rounds, plan.local)
-    if failure:
-        raise RuntimeError(failure)
-    metrics["training-loss"] = loss
-    made["arrays"] = ArrayRecord({"theta": Array(weights.numpy())})
+    (own,) = adapt(model, theta, [client], job.setting.seed, number, plan.rounds, plan.local).values()
+    if own.failure:
+        raise RuntimeError(own.failure)
+    metrics["training-loss"] = own.loss
+    made["arrays"] = ArrayRecord({"theta": Array(own.weights.numpy())})
     return made
 
 

@@ -1,17 +1,16 @@
-"""fit: train nets on pieces, one or many at once, and keep the weights that validate best."""
+"""fit: train a net on pieces, and keep the weights that validate best."""
 
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc import InputError
-from coopoc.arrays import Floats, Ints, check_fields, instance
+from coopoc.arrays import Floats, Ints, instance
 from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
@@ -21,21 +20,6 @@ from ..nets.stack import flatten, unflatten
 from .clients import Batch, Segments, mirrored
 from .machine import one_core, watched
 from .schedule import Schedule, cosine, generator
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """One net to train: its start, its pieces, and the key of its batches: a seed and the name of the data."""
-
-    model: Gain
-    training: Segments
-    validation: Segments
-    seed: int = 0
-    name: str = ""
-    long: Segments | None = None
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +57,7 @@ class Fit:
         return min(self.history, key=lambda row: row.validation_loss)
 
 
+@one_core()
 def fit(
     model: Gain,
     training: Segments,
@@ -81,6 +66,7 @@ def fit(
     seed: int = 0,
     progress: str | None = None,
     long: Segments | None = None,
+    name: str = "",
 ) -> Fit:
     """Minimise 1/T sum_t ||xhat_t - x_t||^2 over batches of pieces; weights decay by AdamW.
 
@@ -92,6 +78,7 @@ def fit(
         seed: of the order of the batches.
         progress: name of the stage for a progress bar on stderr, None for no bar.
         long: long segments on which the selected weights must not diverge.
+        name: of the data, which with the seed decides the order of the batches.
 
     References:
         arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
@@ -103,46 +90,27 @@ def fit(
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
     2
     """
-    return fit_many([Task(model, training, validation, seed, long=long)], schedule, progress)[0]
-
-
-@one_core()
-def fit_many(tasks: Sequence[Task], schedule: Schedule = Schedule(), progress: str | None = None) -> list[Fit]:
-    """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding.
-
-    Raises:
-        InputError: some of the tasks have long pieces and some have none.
-    """
-    instance("schedule", schedule, Schedule)
-    began = time.perf_counter()
-    like, theta = tasks[0].model, flatten([t.model for t in tasks])
-    pool, members = pooled([t.training for t in tasks])
-    streams = [stream(t.seed, "batches", 0, t.name) for t in tasks]
-    plans = [rows[schedule.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
-    long = [t.long for t in tasks if t.long is not None]
-    if long and len(long) < len(tasks):
-        actual = f"with {len(long)} of {len(tasks)} tasks"
-        raise InputError("long", actual, "must be given with all tasks or with none", "Train them apart.")
-    judge = Judge([[t.validation for t in tasks], *([long] if long else [])], like)
-    history = [[Progress(0, w.clone(), math.nan, float(loss))] for w, loss in zip(theta, judge(theta), strict=True)]
-    stopped: dict[int, str] = {}
-    so_far: list[Tensor] = []
-    rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
-    due = [set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist()) for plan in plans]
-    draws = [generator(draw) for draw in streams]
-    steps = descend(theta, like, pool, plans, rates, schedule, draws, stopped)
-    for step, losses in watched(steps, progress, "step", max(map(len, plans))):
+    model, schedule = instance("model", model, Gain), instance("schedule", schedule, Schedule)
+    for field, pieces in (
+        ("training", training),
+        ("validation", validation),
+        ("long", validation if long is None else long),
+    ):
+        instance(field, pieces, Segments)
+    began, theta, draw = time.perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
+    plan, judge = schedule.plan(len(training), draw), Judge([[validation], *([] if long is None else [[long]])], model)
+    history, so_far = [Progress(0, theta[0].clone(), math.nan, float(judge(theta)))], list[Tensor]()
+    due = set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist())
+    rates, draws, stopped = schedule.learning_rate * cosine(len(plan)), [generator(draw)], dict[int, str]()
+    steps = descend(theta, model, training, [plan], [rates], schedule, draws, stopped)
+    for step, losses in watched(steps, progress, "step", len(plan)):
         so_far.append(losses)
-        checked = [row for row in range(len(tasks)) if step in due[row] and row not in stopped]
-        if checked:
-            validated = judge(theta)
-            for row in checked:
-                mean = torch.stack([one[row] for one in so_far[history[row][-1].step :]]).mean()
-                history[row].append(Progress(step, theta[row].clone(), float(mean), float(validated[row])))
-    seconds = (time.perf_counter() - began) / len(tasks)
-    fits = [Fit(like, tuple(rows), stopped.get(i), seconds) for i, rows in enumerate(history)]
-    reason = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
-    return [fit if fit.stopped or fit.best.validation_loss < math.inf else replace(fit, stopped=reason) for fit in fits]
+        if step in due and not stopped:
+            mean = float(torch.cat(so_far[history[-1].step :]).mean())
+            history.append(Progress(step, theta[0].clone(), mean, float(judge(theta))))
+    if not stopped and min(row.validation_loss for row in history) == math.inf:
+        stopped[0] = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
+    return Fit(model, tuple(history), stopped.get(0), time.perf_counter() - began)
 
 
 def descend(
