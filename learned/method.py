@@ -1,7 +1,8 @@
 """LearnedGain: a trained net as a method, Recording -> Track."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +21,6 @@ from coopoc.world.recording import Recording, Vehicles, check_recording
 from .stream import GainStream
 from .training.machine import one_core
 
-if TYPE_CHECKING:
-    from .nets.gain import Recurrent
-
 SIZE = 3
 """Components of a position."""
 
@@ -35,7 +33,7 @@ class LearnedGain(Alone):
     first fix, so that float32 costs no accuracy far from the origin.
 
     Args:
-        model: trained net.
+        model: trained net, as `nets.gain.Recurrent`.
         name: label in tables.
         x0: (R, E, 3) or (E, 3) m, an exact start as in KalmanNet's published loop; None starts at the first fix.
 
@@ -47,7 +45,7 @@ class LearnedGain(Alone):
     0
     """
 
-    model: "Recurrent"
+    model: Callable[..., Any]
     name: str = "fedkalmannet"
     x0: Floats | None = None
 

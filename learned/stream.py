@@ -1,6 +1,6 @@
 """GainStream: a net that filters step by step, near its own origin."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +11,6 @@ from coopoc.methods.motion_history import MotionHistory, three
 
 from .training.machine import one_core
 
-if TYPE_CHECKING:
-    from .nets.gain import Recurrent
-
 
 class GainStream:
     """A net, step by step: `step` takes the new measurements and returns the estimate.
@@ -21,12 +18,12 @@ class GainStream:
     The origin of the net's positions moves along with the estimate: float32 is as accurate after a day as after a step.
 
     Args:
-        model: the net.
+        model: the net, as `nets.gain.Recurrent`.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
         history: s, how old a delayed fix may be.
     """
 
-    def __init__(self, model: "Recurrent", x0: npt.ArrayLike | None, history: float) -> None:
+    def __init__(self, model: Any, x0: npt.ArrayLike | None, history: float) -> None:
         self.history, self._model = MotionHistory(history), model
         self._x: Floats = np.full(3, np.nan) if x0 is None else three("x0", x0)
         self._memory = model.start(torch.zeros((1, 3), dtype=next(model.parameters()).dtype))
