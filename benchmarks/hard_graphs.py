@@ -1,6 +1,7 @@
 """Hard variants of a factor graph: cropped, without most of its loops, with odometry that is worse."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +22,9 @@ def odometry(graph: Graph) -> np.ndarray:
     return (letter[i] == letter[j]) & (np.abs(place[i] - place[j]) == 1)
 
 
-def _edges(edges: object, keep: np.ndarray, number: np.ndarray | None = None) -> object:
-    changes = {name: getattr(edges, name)[keep] for name in edges.__dataclass_fields__}  # type: ignore[attr-defined]
+def kept(edges: Any, keep: np.ndarray, number: np.ndarray | None = None) -> Any:
+    """The edges that are kept, with vertices numbered anew."""
+    changes = {name: getattr(edges, name)[keep] for name in edges.__dataclass_fields__}
     if number is not None:
         changes["nodes"] = number[changes["nodes"]]
     return type(edges)(**changes)
@@ -41,13 +43,13 @@ def cropped(graph: Graph, share: float = 0.5) -> Graph:
     keep &= graph.is_pose | (held >= 3)
     number = np.cumsum(keep) - 1
     changes = {
-        field: _edges(edges, keep[edges.nodes].all(axis=1), number)
+        field: kept(edges, keep[edges.nodes].all(axis=1), number)
         for field in FIELDS
         if len(edges := getattr(graph, field))
     }
     fixed = graph.fixed[keep[graph.fixed]] if len(graph.fixed) else graph.fixed
     vertices = {name: getattr(graph, name)[keep] for name in ("is_pose", "position", "orientation", "stamps")}
-    names = tuple(name for name, kept in zip(graph.names, keep, strict=True) if kept)
+    names = tuple(name for name, stays in zip(graph.names, keep, strict=True) if stays)
     return replace(graph, names=names, fixed=number[fixed] if len(fixed) else fixed, **vertices, **changes)
 
 
@@ -66,7 +68,7 @@ def fewer_loops(graph: Graph, share: float = 0.1, seed: int = 0) -> Graph:
                 keep[k] |= any(enough[i] < 4 for i in points)
                 enough[points] += keep[k]
         if len(edges):
-            changes[field] = _edges(edges, keep)
+            changes[field] = kept(edges, keep)
     return replace(graph, **changes)
 
 

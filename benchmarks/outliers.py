@@ -9,12 +9,11 @@ that stay and right ones that go; ATE is that of the poses after alignment.
 
 import argparse
 import time
-from dataclasses import replace
 
 import gtsam
 import numpy as np
 from tabulate import tabulate
-from unseen_graphs import joined, manhattan, world
+from unseen_graphs import joined, lost, manhattan, world, wrong
 
 from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats.graph import Graph
@@ -22,8 +21,6 @@ from coopoc.optimize import solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures
 
 SHARES = (0.1, 0.3, 0.5, 0.8)
-WRONG = 0.2
-"""m, from which a loop's position is no noise of 0.02 m."""
 
 
 def by_gtsam(graph: Graph, start: np.ndarray, loops: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -52,9 +49,7 @@ def rows(share: float, ways: list[str]) -> list[list[object]]:
     graph = manhattan(1.0, share)(0)
     problem = from_graph(graph, start="odometry")
     ((factor, loops),) = loop_closures(problem)
-    i, j = graph.relative_pose.nodes[loops].T
-    gap = np.einsum("mji,mj->mi", graph.rotation[i], graph.position[j] - graph.position[i])
-    wrong = np.linalg.norm(gap - graph.relative_pose.position[loops], axis=1) > WRONG
+    bad = wrong(graph)[loops]
     found = []
     for way in ways:
         began = time.process_time()
@@ -65,21 +60,17 @@ def rows(share: float, ways: list[str]) -> list[list[object]]:
             weights, position = solution.extras["weights"], solution.position
         spent, out = time.process_time() - began, weights < 0.5
         error = alignment_error(position, graph.position)
-        found.append([share, int(wrong.sum()), way, int((wrong & ~out).sum()), int((~wrong & out).sum()), error, spent])
+        found.append([share, int(bad.sum()), way, int((bad & ~out).sum()), int((~bad & out).sum()), error, spent])
     return found
 
 
 def fleet(seed: int, d: int, robots: int, share: float) -> list[object]:
     """What happens to the measurements between robots whose frames are unknown: a row."""
     drives = world(seed, d, robots, 200)
-    pairs = drives.near(120, 8.0, others=True)
-    between = drives.relative(pairs, 0.1, 0.03, wrong=share)
-    gap = np.einsum(
-        "mji,mj->mi", drives.rotation[pairs[:, 0]], drives.position[pairs[:, 1]] - drives.position[pairs[:, 0]]
-    )
-    wrong = np.linalg.norm(gap - between.position, axis=1) > 8 * 0.1
+    between = drives.relative(drives.near(120, 8.0, others=True), 0.1, 0.03, wrong=share)
     graph = drives.graph(relative_pose=joined(drives.relative(drives.chain(), 0.05, 0.02), between))
-    problem = from_graph(replace(graph, position=np.full_like(graph.position, np.nan)), start="odometry")
+    bad = wrong(graph)[-len(between) :]
+    problem = from_graph(lost(graph), start="odometry")
     began = time.process_time()
     solution = solve_gnc(problem, loop_closures(problem), start="known", throw=False)
     out = solution.extras["weights"] < 0.5
@@ -88,9 +79,9 @@ def fleet(seed: int, d: int, robots: int, share: float) -> list[object]:
     return [
         f"{d}-D, {robots} robots",
         share,
-        int(wrong.sum()),
-        int((wrong & ~out).sum()),
-        int((~wrong & out).sum()),
+        int(bad.sum()),
+        int((bad & ~out).sum()),
+        int((~bad & out).sum()),
         error,
         spent,
     ]

@@ -176,6 +176,19 @@ def joined(*parts: PoseEdges) -> PoseEdges:
     return PoseEdges(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
+def wrong(graph: Graph) -> np.ndarray:
+    """(M,) relative poses that are 8 standard deviations and more off the vertices, which hold the truth."""
+    edges = graph.relative_pose
+    i, j = edges.nodes.T
+    gap = np.einsum("mji,mj->mi", graph.rotation[i], graph.position[j] - graph.position[i])
+    return np.asarray(np.linalg.norm(gap - edges.position, axis=1) > 8 * np.sqrt(edges.covariance[:, 0, 0]))
+
+
+def lost(graph: Graph) -> Graph:
+    """The graph without what its vertices hold."""
+    return replace(graph, position=np.full_like(graph.position, np.nan))
+
+
 def range_aided(seed: int) -> Graph:
     """One robot of 4,095 poses, 1,807 ranges to four landmarks, no loops."""
     w = world(seed, 2, 1, 4095, 4)
@@ -248,8 +261,7 @@ def manhattan(factor: float, wrong: float = 0.0) -> Callable[[int], Graph]:
 
 def hidden_frames(seed: int) -> Graph:
     """Four robots of which nothing is known but what they measure of one another."""
-    graph = five_robots(seed)
-    return replace(graph, position=np.full_like(graph.position, np.nan))
+    return lost(five_robots(seed))
 
 
 def weights(seed: int) -> Graph:

@@ -42,7 +42,7 @@ def spherical() -> Problem:
 
 def drive(dimension: int, objective: Any) -> Problem:
     """Two robots of six poses each from the truth: odometry, loops, and ranges between them, the first pose held."""
-    graph = random_graph(dimension, dimension, steps=6, landmarks=0, loops=4, ranges=8, seen=0, step_std=0.1)
+    graph = random_graph(3, dimension, steps=6, landmarks=0, loops=4, ranges=8, seen=0, step_std=0.1)
     return from_graph(graph, objective, "file")
 
 

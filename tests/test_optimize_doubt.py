@@ -14,7 +14,6 @@ from scipy.stats import chi2
 import coopoc as co
 from coopoc.cli import main
 from coopoc.formats import load_graph
-from coopoc.formats.graph import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
 from coopoc.optimize.assess.assess import TAIL
 from coopoc.optimize.graph_problems import from_graph
@@ -62,7 +61,7 @@ def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones():
 
 
 def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path):
-    graph = replace(random_graph(3, robots=1, steps=30, landmarks=0, seen=0, loops=8), ranges=RangeEdges())
+    graph = random_graph(3, robots=1, steps=30, landmarks=0, ranges=0, seen=0, loops=8)
     write_graph(graph, whole := tmp_path / "whole.g2o")
     lines = [line for line in whole.read_text().splitlines() if line.startswith("EDGE")]
     (alone := tmp_path / "alone.g2o").write_text("\n".join(lines))
@@ -85,11 +84,11 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
     assert json.loads(out)["notes"] != []
 
 
-@pytest.mark.parametrize("seed", [9, 12])
+@pytest.mark.parametrize("seed", [7, 13])
 def test_a_race_ends_where_the_best_of_all_starts_ends(seed):
     """Odometry that turns by 0.6 rad a step: some starts end in other minima."""
     graph = random_graph(seed, robots=1, steps=40, landmarks=0, ranges=0, seen=0, loops=4, turn_std=0.6)
-    graph = replace(graph, ranges=RangeEdges(), guess=True)
+    graph = replace(graph, guess=True)
     costs = [
         solve(from_graph(graph, start=start), throw=False).cost for start in ("odometry", "file", "linear", "tree")
     ]
@@ -101,7 +100,7 @@ def test_a_race_ends_where_the_best_of_all_starts_ends(seed):
 
 def test_covariances_of_many_nodes_are_computed_where_asked():
     """Also without them a free node is named, and the time that is printed is what was waited."""
-    graph = replace(random_graph(5, robots=1, steps=1100, landmarks=0, seen=0, loops=20), ranges=RangeEdges())
+    graph = random_graph(5, robots=1, steps=1100, landmarks=0, ranges=0, seen=0, loops=20)
     problem = from_graph(graph)
     plain, full = solve(problem), solve(problem, covariance=True)
     assert np.isnan(plain.covariance).all()
