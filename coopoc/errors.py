@@ -90,11 +90,11 @@ def said(error: BaseException) -> str:
 class MissingLibraryError(ImportError):
     """An optional library or program is not installed: the message carries the line that installs it."""
 
-    def __init__(self, library: str, needed_for: str, package: str, how: str = "pip install") -> None:
-        self.arguments = (library, needed_for, package, how)
-        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: {how} {_where(package)}")
+    def __init__(self, library: str, needed_for: str, package: str) -> None:
+        self.arguments = (library, needed_for, package)
+        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: pip install {_where(package)}")
 
-    def __reduce__(self) -> "tuple[type[MissingLibraryError], tuple[str, str, str, str]]":
+    def __reduce__(self) -> "tuple[type[MissingLibraryError], tuple[str, str, str]]":
         return type(self), self.arguments
 
 

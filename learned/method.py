@@ -12,9 +12,9 @@ from torch import Tensor
 from coopoc.arrays import Floats, check_fields
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
-from coopoc.methods.doubts import doubts
 from coopoc.methods.gaps import in_stretches
-from coopoc.methods.track import Alone, Track, silent_track
+from coopoc.methods.kalman import solo_track
+from coopoc.methods.track import Alone, Track
 from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
@@ -82,7 +82,7 @@ class LearnedGain(Alone):
         estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
-        return silent_track(recording, columns, estimates, None, began, doubts(recording, columns, estimates))
+        return solo_track(recording, columns, estimates, None, began)
 
     def _x0(self, fixes: Floats) -> Floats:
         """(R, E, 3) m, where the filter starts, of its first fixes."""

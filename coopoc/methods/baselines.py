@@ -1,17 +1,16 @@
 """Published baselines: LKF-SA, the Laplacian Kalman filter over the star, and MSMV-R, pseudo-fixes of neighbours."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..arrays import Floats
 from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.pseudo_fixes import run_intersection
-from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
-from .egos import Estimate, assumptions, follow_egos, measurements
+from .egos import filter_stars
 from .gaps import in_stretches
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
@@ -43,16 +42,7 @@ class LKFSA(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        noise = resolve(self.noise_model, recording)
-        return follow_egos(
-            self,
-            recording,
-            egos,
-            lambda ego, inbox: [
-                Estimate(*run_lkf_sa(measurements(recording, ego, inbox), assumptions(recording, noise, ego, inbox)))
-            ],
-            noise.notes,
-        )
+        return filter_stars(self, recording, egos, resolve(self.noise_model, recording), run_lkf_sa)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +78,17 @@ class MSMV(Checked):
         """Track of the egos; InputError if one is unknown or absent."""
         noise_model, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         x, p = solo_estimates(recording, noise_model, columns)
-
-        def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
-            assumed = assumptions(recording, noise_model, ego, inbox)
-            assumed = assumed._replace(broadcast=p, growth=(0.0, 1.0), acceleration=0.0)
-            yield Estimate(*run_intersection(measurements(recording, ego, inbox, x), assumed, False, False, True))
-
-        return follow_egos(self, recording, egos, run, (*noise_model.notes, RECONSTRUCTION))
+        return filter_stars(
+            self,
+            recording,
+            egos,
+            replace(noise_model, notes=(*noise_model.notes, RECONSTRUCTION)),
+            lambda inputs, assumed: run_intersection(inputs, assumed, False, False, True),
+            x,
+            broadcast=p,
+            growth=(0.0, 1.0),
+            acceleration=0.0,
+        )
 
 
 def solo_estimates(

@@ -1,15 +1,13 @@
 """CovarianceIntersection: each neighbour's solo estimate, seen from the ego, fused without assuming independence."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
-from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE_AND_COV
 from .baselines import solo_estimates
-from .egos import Estimate, assumptions, follow_egos, measurements
+from .egos import filter_stars
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .odometry_fault import with_odometry
@@ -66,9 +64,13 @@ class CovarianceIntersection(Checked):
         if gates:
             recording, noise_model = with_odometry(recording, columns, noise_model)
         x, p = solo_estimates(recording, noise_model, columns, gates)
-
-        def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
-            assumed = assumptions(recording, noise_model, ego, inbox)._replace(broadcast=p, growth=ESTIMATE_GROWTH)
-            yield Estimate(*run_intersection(measurements(recording, ego, inbox, x), assumed, self.split, gates, False))
-
-        return follow_egos(self, recording, egos, run, noise_model.notes)
+        return filter_stars(
+            self,
+            recording,
+            egos,
+            noise_model,
+            lambda inputs, assumed: run_intersection(inputs, assumed, self.split, gates, False),
+            x,
+            broadcast=p,
+            growth=ESTIMATE_GROWTH,
+        )

@@ -1,8 +1,8 @@
 """The loop of filters of a star: each ego opens its inbox, hands arguments to its kernel, and fills its Track."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,6 +76,31 @@ def follow_egos(
     late = absent if absent.any() and not needs_fix(method) else None
     counted = received, sent, seconds, neighbours, notes
     return Track(recording.t, tuple(columns), x, cov, *counted, extras=whole, ids=recording.ids, absent=late)
+
+
+def filter_stars(
+    method: Method,
+    recording: Recording,
+    egos: Vehicles,
+    noise_model: NoiseModel,
+    kernel: Callable[[Measurements, Assumptions], tuple[Floats, Floats, Floats]],
+    sent: Floats | None = None,
+    **assumed: Any,
+) -> Track:
+    """Track of the egos by a kernel that filters a whole drive of a star: position, covariance and neighbours.
+
+    Args:
+        noise_model: of the filter.
+        kernel: of `measurements` and `assumptions`.
+        sent: positions in messages, `broadcast` of `measurements`.
+        assumed: fields that differ from those of `assumptions`.
+    """
+
+    def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
+        known = assumptions(recording, noise_model, ego, inbox)._replace(**assumed)
+        yield Estimate(*kernel(measurements(recording, ego, inbox, sent), known))
+
+    return follow_egos(method, recording, egos, run, noise_model.notes)
 
 
 def measurements(recording: Recording, ego: int, inbox: Inbox, broadcast: Floats | None = None) -> Measurements:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..kernels.stars.joint_filter import run_filter
 from ..world.recording import Recording, Vehicles
 from ..world.v2x import FIX_AND_VELOCITY
-from .egos import Estimate, assumptions, follow_egos, measurements
+from .egos import filter_stars
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .odometry_fault import with_odometry
@@ -52,16 +52,6 @@ class JointFilter(Checked):
         if self.robust:
             recording, noise = with_odometry(recording, recording.observing(egos), noise)
         refine, gates = (wish and noise.exact_relative for wish in (self.exact, self.robust))
-        return follow_egos(
-            self,
-            recording,
-            egos,
-            lambda ego, inbox: [
-                Estimate(
-                    *run_filter(
-                        measurements(recording, ego, inbox), assumptions(recording, noise, ego, inbox), refine, gates
-                    )
-                )
-            ],
-            noise.notes,
+        return filter_stars(
+            self, recording, egos, noise, lambda inputs, assumed: run_filter(inputs, assumed, refine, gates)
         )

@@ -21,7 +21,7 @@ from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .odometry_fault import with_odometry
 from .stream import FilterStream
-from .track import Alone, Checked, Track, silent_track
+from .track import Alone, Checked, Track
 
 
 @dataclass(frozen=True)
@@ -128,17 +128,19 @@ def solo_track(
     recording: Recording,
     columns: Sequence[int],
     x: Floats,
-    p: Floats,
+    p: Floats | None,
     began: float,
     notes: tuple[str, ...] = (),
     noise_model: NoiseModel | str = "nominal",
 ) -> Track:
-    """Track of a solo filter with the variances p (R, T, E, 3) m^2; it receives and sends nothing."""
-    cov = np.zeros((*p.shape, 3))
-    np.einsum("...ii->...i", cov)[:] = p
+    """Track of a solo filter with the variances p (R, T, E, 3) m^2, if it claims any; it receives and sends nothing."""
+    cov, none = None if p is None else np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
+    if cov is not None:
+        np.einsum("...ii->...i", cov)[:] = p
+        cov.flags.writeable = False  # so that the Track need not copy it
     notes = (*notes, *doubts(recording, columns, x, cov, noise_model))
-    x.flags.writeable = cov.flags.writeable = False  # so that the Track need not copy them
-    return silent_track(recording, columns, x, cov, began, notes)
+    x.flags.writeable = False
+    return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
 
 def solo_filter(

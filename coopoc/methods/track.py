@@ -8,7 +8,6 @@ import numpy as np
 
 from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown
-from ..kernels.compiling.waiting import clock
 from ..text import short_repr
 from ..world.fleet import columns, same_drive
 from ..world.long_table import long_table
@@ -165,25 +164,12 @@ LOST_STDS = 100.0
 """Standard deviations (norm of that of the fixes) between an estimate and a fix, beyond which a method is lost."""
 
 
-def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: float = LOST_STDS) -> Bools:
-    """(R, E) whether estimates (R, T, E, 3) m are ever farther from a fix than `limit` standard deviations."""
+def far_off(x: Floats, recording: Recording, columns: Sequence[int]) -> Bools:
+    """(R, E) whether estimates (R, T, E, 3) m are ever farther from a fix than LOST_STDS standard deviations."""
     gap = recording.gnss.take(columns, axis=2)
     gap -= x
-    far = np.einsum("...c,...c->...", gap, gap) > limit**2 * np.square(recording.sensors.gnss_std).sum()
+    far = np.einsum("...c,...c->...", gap, gap) > LOST_STDS**2 * np.square(recording.sensors.gnss_std).sum()
     return np.asarray(far.any(axis=1))
-
-
-def silent_track(
-    recording: Recording,
-    columns: Sequence[int],
-    x: Floats,
-    cov: Floats | None,
-    began: float,
-    notes: tuple[str, ...],
-) -> Track:
-    """Track of a method that receives and sends nothing."""
-    none = np.zeros((recording.runs, len(columns)))
-    return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
 
 @runtime_checkable

@@ -48,13 +48,13 @@ def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval
     return None if kept is None else results.interval(value, kept)
 
 
-def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
+def rms(results: Results, where: Where) -> float | None:
     """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: the quantity that the bound bounds."""
-    kept = present(results, where, value)
+    kept = present(results, where)
     if kept is None:
         return None
     by = [name for name in ("ego", "train_seed") if name in results.frame]
-    squares = results.select(kept).groupby(by, dropna=False)[value].agg(lambda values: (values**2).mean())
+    squares = results.select(kept).groupby(by, dropna=False)["rt_le_m"].agg(lambda values: (values**2).mean())
     return float(np.sqrt(squares).mean())
 
 

@@ -66,12 +66,9 @@ class Row(NamedTuple):
         return f"round {self.number}: validation {mean:.4f} m^2 over {len(losses)} clients{why}"
 
 
-def server_app(main: "Callable[[Grid, Context], None] | None" = None) -> "ServerApp":
-    """The ServerApp of a federation.
-
-    Args:
-        main: function of grid and context; default: all rounds by the run's configuration (`job_of`; `nodes` to wait
-            for, `timeout` s of a round, `out`, the checkpoint), one line per round on stdout.
+def server_app() -> "ServerApp":
+    """The ServerApp of a federation: all rounds by the run's configuration (`job_of`; `nodes` to wait for, `timeout` s
+    of a round, `out`, the checkpoint), one line per round on stdout.
 
     Raises:
         MissingLibraryError: Flower is not installed.
@@ -80,7 +77,7 @@ def server_app(main: "Callable[[Grid, Context], None] | None" = None) -> "Server
     from flwr.serverapp import ServerApp
 
     app = ServerApp()
-    app.main()(main or configured)
+    app.main()(configured)
     return app
 
 
