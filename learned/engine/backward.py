@@ -4,7 +4,6 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import compiled, part
-from coopoc.learned.engine import layers as on
 from coopoc.learned.engine.forward import Drives, State, follow, missing, new_state
 from coopoc.learned.engine.layers import (
     CELLS,
@@ -145,33 +144,18 @@ def correct_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane:
 @part
 def infer_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
     """`forward.infer` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
-    columns = net.columns
-    backward_layer(net, on.L_POSTERIOR, tape, gradient, row, lanes)
-    for lane in range(row, row + lanes):
-        for j in range(CELLS):
-            gradient[lane, columns.prior + j] = gradient[lane, columns.prior_copy + j]
-    backward_layer(net, on.L_BACK, tape, gradient, row, lanes)
-    backward_layer(net, on.L_GAIN, tape, gradient, row, lanes)
-    backward_layer(net, on.L_HIDDEN, tape, gradient, row, lanes)
-    gru_back(net, on.L_INNOVATION_X, columns.innovation_old, columns.innovation, tape, gradient, row, lanes)
-    backward_layer(net, on.L_OBSERVATION, tape, gradient, row, lanes)
-    backward_layer(net, on.L_EXPECTED, tape, gradient, row, lanes)
-    gru_back(net, on.L_PRIOR_X, columns.prior_old, columns.prior, tape, gradient, row, lanes)
-    backward_layer(net, on.L_EVOLUTION, tape, gradient, row, lanes)
-    gru_back(net, on.L_PROCESS_X, columns.process_old, columns.process, tape, gradient, row, lanes)
-    backward_layer(net, on.L_UPDATE, tape, gradient, row, lanes)
-
-
-@part
-def gru_back(
-    net: Net, layer: Index, old: Index, new: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index
-) -> None:
-    """`forward.gru` backwards."""
-    for lane in range(row, row + lanes):
-        after, unit = gradient[lane, new : new + CELLS], gradient[lane, old : old + GATES]
-        blend_back(tape[lane, old : old + 8 * PAD], after, unit)
-    backward_layer(net, layer, tape, gradient, row, lanes)
-    backward_layer(net, layer + 1, tape, gradient, row, lanes)
+    columns, last = net.columns, len(net.layers) - 1
+    for layer in range(last, -1, -1):
+        old, new = net.layers[layer, 11], net.layers[layer, 12]
+        if new > 0:
+            for lane in range(row, row + lanes):
+                unit = gradient[lane, old : old + GATES]
+                blend_back(tape[lane, old : old + 8 * PAD], gradient[lane, new : new + CELLS], unit)
+        backward_layer(net, layer, tape, gradient, row, lanes)
+        if layer == last:
+            for lane in range(row, row + lanes):
+                for j in range(CELLS):
+                    gradient[lane, columns.prior + j] = gradient[lane, columns.prior_copy + j]
 
 
 @part

@@ -6,7 +6,6 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import compiled, part, storage
-from coopoc.learned.engine import layers as on
 from coopoc.learned.engine.layers import (
     CELLS,
     FROM_H,
@@ -79,7 +78,7 @@ def follow(
     for t in range(len(drives.dt)):
         row = keep * t * lanes
         features(drives, state, net, tape, row, t, rows)
-        infer(net, state, tape, row, lanes)
+        infer(net, tape, row, lanes)
         for lane in range(lanes):
             correct(drives, state, net, tape[row + lane], lane, (t, s, first + lane))
             for i in range(3):
@@ -110,8 +109,8 @@ def missing(gnss: Floats, at: tuple[Index, Index, Index]) -> bool:
 def features(
     drives: Drives, state: State, net: Net, tape: Floats, row: Index, t: Index, rows: tuple[Index, Index, Index]
 ) -> None:
-    """Input features of GainNet: directions and lengths of four differences, and the innovation; a missing fix repeats
-    the last."""
+    """Inputs of a step of GainNet: its old states, directions and lengths of four differences, and the innovation; a
+    missing fix repeats the last."""
     real, at = tape.dtype.type, net.columns.changes
     residual, lengths = net.columns.residual, net.columns.lengths
     s, first, lanes = rows
@@ -131,44 +130,33 @@ def features(
             scale = real(0.0) if length <= real(SHORTEST_LENGTH) else real(1.0) / length
             own[c], own[c + 1], own[c + 2] = u * scale, v * scale, w * scale
             own[lengths + change] = length
-
-
-@part
-def infer(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> None:
-    """Forward pass of the GRUs, from the features to the gain and the posterior."""
-    columns = net.columns
-    forward_layer(net, on.L_UPDATE, tape, row, lanes)
-    gru(net, on.L_PROCESS_X, columns.process_old, columns.process, state.process, tape, row, lanes)
-    forward_layer(net, on.L_EVOLUTION, tape, row, lanes)
-    gru(net, on.L_PRIOR_X, columns.prior_old, columns.prior, state.prior, tape, row, lanes)
-    forward_layer(net, on.L_EXPECTED, tape, row, lanes)
-    forward_layer(net, on.L_OBSERVATION, tape, row, lanes)  # after `expected`, whose last vector reaches into it
-    gru(net, on.L_INNOVATION_X, columns.innovation_old, columns.innovation, state.innovation, tape, row, lanes)
-    forward_layer(net, on.L_HIDDEN, tape, row, lanes)
-    forward_layer(net, on.L_GAIN, tape, row, lanes)
-    forward_layer(net, on.L_BACK, tape, row, lanes)
-    for lane in range(row, row + lanes):
         for j in range(CELLS):
-            tape[lane, columns.prior_copy + j] = tape[lane, columns.prior + j]
-    forward_layer(net, on.L_POSTERIOR, tape, row, lanes)
+            own[net.columns.process_old + j], own[net.columns.prior_old + j] = (
+                state.process[lane, j],
+                state.prior[lane, j],
+            )
+            own[net.columns.innovation_old + j] = state.innovation[lane, j]
 
 
 @part
-def gru(
-    net: Net, layer: Index, old: Index, begin: Index, state: Floats, tape: Floats, row: Index, lanes: Index
-) -> None:
-    """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h' = n + z (h - n), biases in W and U.
+def infer(net: Net, tape: Floats, row: Index, lanes: Index) -> None:
+    """Forward pass, from the features and the old states to the gain and the posterior.
 
-    The fields of a GRU follow each other: old state, W x, U h, gates. Gates are computed over PAD columns, of which
-    nine count, because loops of such a length vectorise.
+    A GRU: r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h' = n + z (h - n), biases in W and U. Its fields follow
+    each other: old state, W x, U h, gates. Gates are computed over PAD columns, of which nine count, because loops of
+    such a length vectorise.
     """
-    for lane in range(lanes):
-        for j in range(CELLS):
-            tape[row + lane, old + j] = state[lane, j]
-    forward_layer(net, layer, tape, row, lanes)
-    forward_layer(net, layer + 1, tape, row, lanes)
-    for lane in range(row, row + lanes):
-        blend(tape[lane, old : old + 8 * PAD], tape[lane, begin : begin + CELLS])
+    columns, last = net.columns, len(net.layers) - 1
+    for layer in range(last + 1):
+        if layer == last:
+            for lane in range(row, row + lanes):
+                for j in range(CELLS):
+                    tape[lane, columns.prior_copy + j] = tape[lane, columns.prior + j]
+        forward_layer(net, layer, tape, row, lanes)
+        old, new = net.layers[layer, 11], net.layers[layer, 12]
+        if new > 0:
+            for lane in range(row, row + lanes):
+                blend(tape[lane, old : old + 8 * PAD], tape[lane, new : new + CELLS])
 
 
 @part

@@ -69,13 +69,13 @@ TOGETHER = ("process", "expected", "prior", "innovation", "prior_copy")
 """Fields that end where the next one begins; the others have room for the last vector of what is written there."""
 _ROWS = (
     "update.weight changes 9 corrected 1 1",
-    "evolution.weight changes 6 evolved 1 1",
-    "observation.weight changes 0 observed 1 1",
     "process.weight_ih corrected 0 process_x 0 1",
     "process.weight_hh process_old 0 process_h 0 0",
+    "evolution.weight changes 6 evolved 1 1",
     "prior.weight_ih process 0 prior_x 0 0",
     "prior.weight_hh prior_old 0 prior_h 0 0",
     "prior_to_innovation.weight prior 0 expected 1 0",
+    "observation.weight changes 0 observed 1 1",  # after `expected`, whose last vector reaches into it
     "innovation.weight_ih expected 0 innovation_x 0 1",
     "innovation.weight_hh innovation_old 0 innovation_h 0 0",
     "gain_hidden.weight prior 0 hidden 1 0",
@@ -84,28 +84,12 @@ _ROWS = (
     "posterior.weight prior_copy 0 posterior 1 1",
 )
 LAYERS = [row.split() for row in _ROWS]
-"""Layers in the order of `L_UPDATE` and the rest: parameter, field and first column of the inputs, field of the
-outputs, 1 where a ReLU follows, 1 where backward finds no gradient at the inputs yet."""
-(
-    L_UPDATE,
-    L_EVOLUTION,
-    L_OBSERVATION,
-    L_PROCESS_X,
-    L_PROCESS_H,
-    L_PRIOR_X,
-    L_PRIOR_H,
-    L_EXPECTED,
-    L_INNOVATION_X,
-    L_INNOVATION_H,
-    L_HIDDEN,
-    L_GAIN,
-    L_BACK,
-    L_POSTERIOR,
-) = np.arange(len(LAYERS))
+"""Layers in the order of forward: parameter, field and first column of the inputs, field of the outputs, 1 where a ReLU
+follows, 1 where backward finds no gradient at the inputs yet."""
 
 
 class Plan(NamedTuple):
-    """For nets of one shape: layers (14, 11), first column of each field, columns of the tape, length of
+    """For nets of one shape: layers (14, 13), first column of each field, columns of the tape, length of
     `Net.matrices`, number of parameters."""
 
     layers: Ints
@@ -144,7 +128,8 @@ def plan_of(shapes: Shapes) -> Plan:
         outputs, inputs = sizes[name]
         back = size + inputs * whole(outputs)
         bias = back + outputs * whole(inputs)
-        starts = begin[name], begin[name.replace("weight", "bias")]
+        starts, gru = (begin[name], begin[name.replace("weight", "bias")]), name.partition(".weight_hh")
+        unit = (columns[f"{gru[0]}_old"], columns[gru[0]]) if gru[1] else (0, 0)
         rows.append(
             [
                 *starts,
@@ -157,6 +142,7 @@ def plan_of(shapes: Shapes) -> Plan:
                 columns[target],
                 int(relu),
                 int(begins),
+                *unit,
             ]
         )
         size = bias + whole(outputs)
@@ -200,7 +186,7 @@ def unpack(theta: Floats, net: Net) -> None:
 
 @inside
 def columns_of(net: Net, name: Index) -> tuple[Any, ...]:
-    """A row of `Net.layers`."""
+    """A row of `Net.layers` but for its last two: old and new state of the GRU that the layer completes, or 0."""
     row = net.layers[name]
     return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], row[9], row[10]
 
