@@ -133,7 +133,7 @@ DETACHED = APART.add("displacement", [("a", "b"), ("c", "d")], [[4, 0, 0], [1, 0
 ONE_PLACE = Problem(("a", "b"), x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure"])
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "truncated"])
 @pytest.mark.parametrize("name", ["spherical K = 10", "SE(2) window", "SE(3) window"])
 @pytest.mark.parametrize("backend", EVERY)
 def test_every_backend_agrees_on_robust_losses(backend, name, loss):

@@ -1,18 +1,12 @@
 """GTSAM's own factors, optimisers and smoothers: they say our objective to the last digits, and find its minimum."""
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
-from conftest import same_minimum
-from random_graphs import star
+from test_optimize_poses import everything
 
-from coopoc import V2X, Fleet, Sensors, observe
-from coopoc.optimize import Loss, Problem, Status, pose, solve
+from coopoc.optimize import Loss, Problem, pose, solve
 from coopoc.optimize.backends.gtsam import forms, graph_of, tangent, values, which_turn
-from coopoc.optimize.starts.initial import initial_guess
 
 LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 
@@ -123,119 +117,13 @@ def test_what_gtsam_lacks_is_a_custom_factor(dimension, kind, nodes, noise, loss
     assert_same_objective(problem)
 
 
-def spherical_star(formation: Fleet) -> Problem:
-    """Ten neighbours at 22 m."""
-    recording = observe(formation.between(0, 3), Sensors.paper_scenario2(), V2X.ideal(10), observers=[0])
-    return Problem.from_snapshot(recording, 2, 0)
-
-
-def plane(
-    noise: float = 1.0,
-    steps: int = 8,
-    odometry: tuple[float, ...] = (0.1, 0.1, 0.02),
-    fixed: bool = False,
-    loss: Loss | None = None,
-    wrong: int = 0,
-) -> Problem:
-    """Two vehicles in the plane: odometry, ranges, bearings of each other and of a landmark, fixes, a first pose."""
-    rng = np.random.default_rng(5)
-    turn = np.cumsum(rng.normal(0, 0.2, steps))
-    first = np.cumsum(5.0 * np.c_[np.cos(turn), np.sin(turn)], axis=0)
-    at, angle = (
-        np.concatenate([first, first + np.array([8, 3]), [[10.0, -9.0]]]),
-        np.concatenate([turn, turn + 0.1, [0.0]]),
-    )
-    n, x = 2 * steps, pose(at, angle)
-    x0 = pose(at + rng.normal(0, 0.5, at.shape), angle + rng.normal(0, 0.05, n + 1))
-    x0[-1, 2:] = np.eye(2).ravel()
-    x0[0] = x[0] if fixed else x0[0]
-    problem = Problem([str(k) for k in range(n + 1)], x0=x0, dimension=2, poses=range(n), fixed=(0,) if fixed else ())
-
-    def seen(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        return np.einsum("kji,kj->ki", x[i, 2:].reshape(-1, 2, 2), at[j] - at[i])
-
-    i = np.concatenate([np.arange(steps - 1), steps + np.arange(steps - 1)])
-    z = pose(
-        seen(i, i + 1) + noise * rng.normal(0, 0.1, (len(i), 2)),
-        angle[i + 1] - angle[i] + noise * rng.normal(0, 0.02, len(i)),
-    )
-    problem = problem.add("relative_pose", np.c_[i, i + 1], z, std=odometry)
-    i, j = np.arange(steps), steps + np.arange(steps)
-    gap = np.linalg.norm(at[i] - at[j], axis=1) + noise * rng.normal(0, 0.3, steps) + 6.0 * (np.arange(steps) < wrong)
-    problem = problem.add("range", np.c_[i, j], gap[:, None], std=0.3, loss=loss)
-    v = seen(j, i)
-    z = np.c_[np.linalg.norm(v, axis=1), np.arctan2(v[:, 1], v[:, 0])]
-    z = z + noise * rng.normal(0, [0.5, 0.05], z.shape)
-    problem = problem.add("body_spherical", np.c_[j, i], z, std=[0.5, 0.05])
-    v = seen(i, np.full(steps, n))
-    bearing = np.arctan2(v[:, 1], v[:, 0]) + noise * rng.normal(0, 0.05, steps)
-    problem = problem.add("bearing", [(k, n) for k in i.tolist()], bearing[:, None], std=0.05)
-    ends, starts = [steps - 1, n - 1], [steps] if fixed else [0, steps]
-    problem = problem.add("position", ends, at[ends] + noise * rng.normal(size=(2, 2)), std=1.0)
-    return problem.add("pose", starts, x[starts], std=[0.5, 0.3, 0.05])
-
-
-def space(chordal: bool = False, noise: float = 1.0) -> Problem:
-    """Six poses in space in two loops, ranges to two beacons, a first pose; the beacons have a fix."""
-    rng = np.random.default_rng(6)
-    at, turn = np.cumsum(rng.normal(0, 4, (8, 3)), axis=0), rng.normal(size=(8, 3)) * 0.6
-    x = pose(at, turn)
-    rotation = x[:, 3:].reshape(-1, 3, 3)
-    x0 = pose(at + rng.normal(0, 0.3, at.shape), turn + rng.normal(0, 0.05, turn.shape))
-    x0[6:, 3:] = np.eye(3).ravel()
-    problem = Problem([str(k) for k in range(8)], x0=x0, poses=range(6))
-    i, j = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (5, 0), (3, 0)]).T
-    error = pose(noise * rng.normal(0, 0.1, (len(i), 3)), noise * rng.normal(0, 0.03, (len(i), 3)))
-    turned = np.swapaxes(rotation[i], 1, 2) @ rotation[j] @ error[:, 3:].reshape(-1, 3, 3)
-    moved = np.einsum("kji,kj->ki", rotation[i], at[j] - at[i]) + error[:, :3]
-    z = np.concatenate([moved, turned.reshape(-1, 9)], axis=1)
-    std = np.array([0.1] * 3 + ([0.05] * 9 if chordal else [0.03] * 3))
-    problem = problem.add("relative_pose" + "_chordal" * chordal, np.c_[i, j], z, std=std)
-    pairs = [(k, 6 + k % 2) for k in range(6)]
-    far = np.array([np.linalg.norm(at[k] - at[b]) for k, b in pairs]) + noise * rng.normal(0, 0.3, 6)
-    problem = problem.add("range", pairs, far[:, None], std=0.3).add("position", [6, 7], at[6:], std=0.5)
-    if chordal:
-        return problem.add("pose_chordal", 0, x[:1], std=0.1)
-    return problem.add("pose", 0, x[:1], std=[0.5, 0.4, 0.3, 0.05, 0.06, 0.07])
-
-
-CASES: dict[str, Callable[[Fleet], Problem]] = {
-    **{f"ranges {seed}": lambda fleet, seed=seed: star("range", seed) for seed in range(3)},
-    "flat ranges": lambda fleet: star("range", 2, height=0.02),
-    "ten spherical neighbours": spherical_star,
-    "SE(2)": lambda fleet: plane(),
-    "SE(2) with a fixed pose": lambda fleet: plane(fixed=True),
-    "SE(2) with forward and sideways std": lambda fleet: plane(odometry=(0.1, 0.03, 0.02)),
-    "SE(3)": lambda fleet: space(),
-    "SE(3) chordal": lambda fleet: space(chordal=True),
-    "SE(2) truncated": lambda fleet: plane(loss=Loss("truncated", 3.0), wrong=2),
-    **{name: lambda fleet, name=name: star("range", 4, loss=Loss(name, 2.0), wrong=1) for name in LOSSES},
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_optimizers_find_the_minimum_of_gauss_newton(formation, case):
-    """Cost to 1e-9, estimates and covariances to 1e-6, before any refinement of ours."""
-    problem = CASES[case](formation)
-    ours, theirs = solve(problem), solve(problem, "gtsam")
-    assert theirs.status is Status.SOLVED
-    same_minimum(theirs, ours)
-
-
-@pytest.mark.parametrize("case", ["ranges 0", "SE(2)"])
-def test_a_limit_of_iterations_is_kept(formation, case):
-    problem = CASES[case](formation)
-    solution = solve(replace(problem, x0=initial_guess(problem)), "gtsam", max_iterations=2, throw=False)
-    assert solution.status is Status.MAX_ITERATIONS
-    assert solution.iterations == 2
-
-
-@pytest.mark.parametrize("problem", [plane(noise=0.0), space(noise=0.0), space(chordal=True, noise=0.0)])
-def test_marginals_equal_gtsams(problem):
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_marginals_equal_gtsams(dimension):
     """gtsam.Marginals, which moves a pose along its body's axes, with the rotation first in space; without residuals,
     on which J^T J of GTSAM's chords depends."""
+    problem, x = everything(dimension, noise=0.0)
     solution, posed = solve(problem), which_turn(problem)
-    marginals = gtsam.Marginals(graph_of(problem, forms(problem)), values(problem.space, posed, solution.x))
-    for i, turn in enumerate(tangent(problem.space, posed, solution.x)):
+    marginals = gtsam.Marginals(graph_of(problem, forms(problem)), values(problem.space, posed, x))
+    for i, turn in enumerate(tangent(problem.space, posed, x)):
         own = turn @ marginals.marginalCovariance(i) @ turn.T
         assert solution.covariance[i] == pytest.approx(own, abs=1e-6)

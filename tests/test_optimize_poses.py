@@ -38,7 +38,7 @@ def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Prob
         nodes = [[names.index(n) for n in c] for c in chosen]
         size, constants = known.size(d), [0.5] * known.constants
         if known.compares_poses:
-            z = np.array([_relative(space, truth, c) for c in nodes])
+            z = np.array([relative(space, truth, c) for c in nodes])
             moved = space.retract(z, noise * rng.normal(size=(len(nodes), space.dof)))
             problem = problem.add(kind, chosen, moved, std=np.full(size, 0.3))
             continue
@@ -49,7 +49,7 @@ def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Prob
     return problem, truth
 
 
-def _relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
+def relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
     p, R = space.position(truth), space.rotation(truth)
     if len(nodes) == 1:
         return truth[nodes[0]]
@@ -152,11 +152,11 @@ def test_poses_without_an_x0_are_found(kind, of, d):
     rng, n, space = np.random.default_rng(d), 30, Space(d, has_rotation=True)
     truth = space.join(rng.normal(0, 9, (n + 4, d)), exp(rng.normal(size=(n + 4, space.angles))))
     problem, pairs = Problem(range(n + 4), dimension=d, poses=range(n)), [[k, n + k % 4] for k in range(n)]
-    moves = [_relative(space, truth, pair) for pair in pairwise(range(n))]
+    moves = [relative(space, truth, pair) for pair in pairwise(range(n))]
     problem = problem.add("relative_pose", [*pairwise(range(n))], moves, std=0.01)
     fixed = slice(of, None if of else n, 1 if of else 3)
     problem = problem.add("position", range(n + 4)[fixed], truth[fixed, :d], std=0.1)
-    gap = np.array([_relative(space, truth, pair)[:d] for pair in pairs])
+    gap = np.array([relative(space, truth, pair)[:d] for pair in pairs])
     if lookup(kind).frame == "world":
         gap = truth[n:, :d][np.arange(n) % 4] - truth[:n, :d]
     seen = lookup(kind).predict(gap)
@@ -219,7 +219,7 @@ def test_what_no_start_knows_is_drawn():
     marks = at.mean() + rng.uniform(-8, 8, 3) + 1j * rng.uniform(-8, 8, 3)
     x, steps = pose(np.c_[at.real, at.imag], h), [*pairwise(range(6))]
     drive = Problem(range(9), dimension=2, poses=range(6)).add("pose", 0, x[0], std=0.05)
-    drive = drive.add("relative_pose", steps, [_relative(space, x, step) for step in steps], std=0.05)
+    drive = drive.add("relative_pose", steps, [relative(space, x, step) for step in steps], std=0.05)
     pairs = [(k, 6 + j) for k in range(6) for j in range(3)]
     found = solve(drive.add("azimuth", pairs, np.angle(marks - at[:, None]).ravel(), std=0.02))
     assert found.cost < 1e-6

@@ -170,6 +170,7 @@ def test_the_limit_of_iterations_is_an_error_with_the_solution(backend):
     with pytest.raises(SolveError, match="limit of iterations") as caught:
         solve(mixed(), backend, max_iterations=1)
     assert caught.value.solution.status is Status.MAX_ITERATIONS
+    assert caught.value.solution.iterations == 1
     assert solve(mixed(), backend, throw=False, max_iterations=1).status is Status.MAX_ITERATIONS
 
 

@@ -14,6 +14,7 @@ import tightness
 from conftest import measured, refused
 from scipy.io import mmread
 from scipy.optimize import least_squares
+from test_optimize_poses import relative
 
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Solution, Status, solve
@@ -21,7 +22,7 @@ from coopoc.optimize.convex import certify, reduced, shor
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
 from coopoc.optimize.convex.reduced import Reduced
 from coopoc.optimize.graph_problems import read_graph
-from coopoc.optimize.model.space import exp
+from coopoc.optimize.model.space import Space, exp
 
 UP = 0.6
 """Vertical against horizontal std in anisotropic problems."""
@@ -43,17 +44,12 @@ def swarm(seed: int, d: int = 3, vehicles: int = 4, gnss_std: float = 3.5, up: f
 def two_robots(seed: int, d: int = 2, fixed: bool = False, noise: float = 1.0, prior: bool = False) -> Problem:
     """Odometry of two robots as chordal relative poses and ranges between them; nothing in the world's frame, but a
     prior of the first pose."""
-    from scipy.spatial.transform import Rotation
-
-    rng, steps = np.random.default_rng(seed), 4
-    turn = Rotation.random(2 * steps, rng=rng).as_matrix() if d == 3 else exp(rng.uniform(-3, 3, (2 * steps, 1)))
-    at = rng.uniform(-5, 5, (2 * steps, d))
-    names = tuple(f"{robot}{k}" for robot in "AB" for k in range(steps))
-    x = np.concatenate([at, turn.reshape(len(at), -1)], axis=1)
-    problem = Problem(names, x0=x, dimension=d, poses=range(2 * steps), fixed=(0,) if fixed else ())  # type: ignore[arg-type]
+    rng, steps, space = np.random.default_rng(seed), 4, Space(d, has_rotation=True)
+    turn, at = exp(rng.uniform(-3, 3, (2 * steps, space.angles))), rng.uniform(-5, 5, (2 * steps, d))
+    names, x = tuple(f"{robot}{k}" for robot in "AB" for k in range(steps)), space.join(at, turn)
+    problem = Problem(names, x0=x, dimension=d, poses=range(2 * steps), fixed=(0,) if fixed else ())
     pairs = [(k, k + 1) for k in range(2 * steps - 1) if k != steps - 1]
-    seen = [np.concatenate([turn[i].T @ (at[j] - at[i]), (turn[i].T @ turn[j]).ravel()]) for i, j in pairs]
-    z = np.array(seen)
+    z = np.array([relative(space, x, pair) for pair in pairs])
     z[:, :d] += 0.05 * noise * rng.standard_normal((len(z), d))
     std = [0.05] * d + [0.02] * d * d
     problem = problem.add("relative_pose_chordal", pairs, z, std)

@@ -140,6 +140,11 @@ def test_curves_draw_numbers_of_their_selections(results):
     mine, alike = {"method": "kalman", "label": "mine"}, [LINES[0], dict(LINES[0])]
     both = figures.curves(results, [panel], [*alike, mine], "c")
     assert [text.get_text() for text in both.figure.axes[0].get_legend().get_texts()][1:] == ["mine"]
+    known = replace(results, frame=results.frame.assign(noise_model="nominal"))
+    plot = figures.curves(
+        known, [replace(panel, where={})], [{**LINES[0], "noise_model": "nominal"}], "c", levels=[{"method": "gnss"}]
+    )
+    assert plot.figure.axes[0].lines[0].get_linestyle() == "-"  # as no line has another noise model
 
 
 def test_every_line_that_coincides_is_named(results):

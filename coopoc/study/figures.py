@@ -126,7 +126,8 @@ def curves(
         logx: logarithmic horizontal axes.
     """
     every, shown = [*lines, *levels], []
-    models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
+    models = {of["noise_model"] for of in every if "noise_model" in of and of.get("method") != "bound"}
+    models -= {"none", "trained"}
     labelled = any("label" in of for of in every)
     for panel in panels:
         drawn: list[tuple[Where, Any]] = []
