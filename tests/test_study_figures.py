@@ -142,7 +142,11 @@ def test_curves_draw_numbers_of_their_selections(results):
     assert [text.get_text() for text in both.figure.axes[0].get_legend().get_texts()][1:] == ["mine"]
     known = replace(results, frame=results.frame.assign(noise_model="nominal"))
     plot = figures.curves(
-        known, [replace(panel, where={})], [{**LINES[0], "noise_model": "nominal"}], "c", levels=[{"method": "gnss"}]
+        known,
+        [replace(panel, where={})],
+        [{**LINES[0], "noise_model": "nominal"}],
+        "c",
+        levels=[{"method": "gnss", "max_neighbours": 0}],
     )
     assert plot.figure.axes[0].lines[0].get_linestyle() == "-"  # as no line has another noise model
 
