@@ -146,7 +146,7 @@ def infer_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Inde
     """`forward.infer` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
     columns, last = net.columns, len(net.layers) - 1
     for layer in range(last, -1, -1):
-        old, new = net.layers[layer, 11], net.layers[layer, 12]
+        old, new = net.layers[layer, 9], net.layers[layer, 10]
         if new > 0:
             for lane in range(row, row + lanes):
                 unit = gradient[lane, old : old + GATES]

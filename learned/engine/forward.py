@@ -153,7 +153,7 @@ def infer(net: Net, tape: Floats, row: Index, lanes: Index) -> None:
                 for j in range(CELLS):
                     tape[lane, columns.prior_copy + j] = tape[lane, columns.prior + j]
         forward_layer(net, layer, tape, row, lanes)
-        old, new = net.layers[layer, 11], net.layers[layer, 12]
+        old, new = net.layers[layer, 9], net.layers[layer, 10]
         if new > 0:
             for lane in range(row, row + lanes):
                 blend(tape[lane, old : old + 8 * PAD], tape[lane, new : new + CELLS])

@@ -89,14 +89,14 @@ follows, 1 where backward finds no gradient at the inputs yet."""
 
 
 class Plan(NamedTuple):
-    """For nets of one shape: layers (14, 13), first column of each field, columns of the tape, length of
-    `Net.matrices`, number of parameters."""
+    """For nets of one shape: layers (14, 11), first column of each field, columns of the tape, length of
+    `Net.matrices`, and places (3, P) there of each parameter: for forward, for backward, and of its gradient."""
 
     layers: Ints
     columns: Columns
     width: int
     size: int
-    parameters: int
+    places: Ints
 
 
 class Net(NamedTuple):
@@ -108,6 +108,7 @@ class Net(NamedTuple):
     matrices: Floats
     layers: Ints
     columns: Columns
+    places: Ints
 
 
 @cache
@@ -123,30 +124,22 @@ def plan_of(shapes: Shapes) -> Plan:
     for name in Columns._fields:
         columns[name], width = end, widths.get(name, CELLS)
         end += width if name in TOGETHER else whole(end + whole(width)) - end
-    rows, size = [], 0
+    rows, size, places = [], 0, np.empty((3, at), np.int64)
     for name, source, first, target, relu, begins in LAYERS:
         outputs, inputs = sizes[name]
         back = size + inputs * whole(outputs)
         bias = back + outputs * whole(inputs)
-        starts, gru = (begin[name], begin[name.replace("weight", "bias")]), name.partition(".weight_hh")
+        o, i = np.indices((outputs, inputs)).reshape(2, -1)
+        ahead, behind = size + i * whole(outputs) + o, back + o * whole(inputs) + i
+        places[:, begin[name] : begin[name] + outputs * inputs] = ahead, behind, ahead if outputs > inputs else behind
+        first_bias = begin[name.replace("weight", "bias")]
+        places[:, first_bias : first_bias + outputs] = bias + np.arange(outputs)
+        gru = name.partition(".weight_hh")
         unit = (columns[f"{gru[0]}_old"], columns[gru[0]]) if gru[1] else (0, 0)
-        rows.append(
-            [
-                *starts,
-                outputs,
-                inputs,
-                size,
-                back,
-                bias,
-                columns[source] + int(first),
-                columns[target],
-                int(relu),
-                int(begins),
-                *unit,
-            ]
-        )
+        ends = columns[source] + int(first), columns[target]
+        rows.append([outputs, inputs, size, back, bias, *ends, int(relu), int(begins), *unit])
         size = bias + whole(outputs)
-    return Plan(np.array(rows), Columns(**columns), end, size, at)
+    return Plan(np.array(rows), Columns(**columns), end, size, places)
 
 
 def whole(columns: int) -> int:
@@ -168,33 +161,27 @@ def aligned(rows: Index, columns: Index, like: Floats) -> Floats:
 @storage
 def new_net(plan: Plan, like: Floats) -> Net:
     """Memory of the weights of one net."""
-    return Net(aligned(1, plan.size + ZEROS, like)[0], plan.layers, plan.columns)
+    return Net(aligned(1, plan.size + ZEROS, like)[0], plan.layers, plan.columns, plan.places)
 
 
 @part
 def unpack(theta: Floats, net: Net) -> None:
     """Copy flat weights (P,) into the matrices."""
-    for layer in range(len(net.layers)):
-        weight, bias, outputs, inputs, ahead, back, start, _, _, _, _ = columns_of(net, layer)
-        across, along = outputs + -outputs % PAD, inputs + -inputs % PAD
-        for o in range(outputs):
-            net.matrices[start + o] = theta[bias + o]
-            for i in range(inputs):
-                value = theta[weight + o * inputs + i]
-                net.matrices[ahead + i * across + o] = net.matrices[back + o * along + i] = value
+    for p in range(len(theta)):
+        net.matrices[net.places[0, p]] = net.matrices[net.places[1, p]] = theta[p]
 
 
 @inside
 def columns_of(net: Net, name: Index) -> tuple[Any, ...]:
     """A row of `Net.layers` but for its last two: old and new state of the GRU that the layer completes, or 0."""
     row = net.layers[name]
-    return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], row[9], row[10]
+    return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8]
 
 
 @inside
 def forward_layer(net: Net, name: Index, tape: Floats, row: Index, lanes: Index) -> None:
     """y = W x + b of a layer at so many rows of the tape."""
-    _, _, outputs, inputs, ahead, _, start, source, to, relu, _ = columns_of(net, name)
+    outputs, inputs, ahead, _, start, source, to, relu, _ = columns_of(net, name)
     width, m, real = tape.shape[1], net.matrices, tape.dtype.type
     x, y = (tape, row * width + source, width), (tape, row * width + to, width)
     floor = real(0.0) if relu else real(-np.inf)
@@ -205,7 +192,7 @@ def forward_layer(net: Net, name: Index, tape: Floats, row: Index, lanes: Index)
 def backward_layer(net: Net, name: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
     """Add W^T dy to dx of a layer at so many rows, or write it if no gradient stands there yet; where the ReLU of the
     layer is shut dy becomes zero."""
-    _, _, outputs, inputs, _, back, _, source, to, relu, begins = columns_of(net, name)
+    outputs, inputs, _, back, _, source, to, relu, begins = columns_of(net, name)
     width = tape.shape[1]
     if relu:
         for lane in range(row, row + lanes):
@@ -235,7 +222,7 @@ def collect(total: Net, tape: Floats, gradient: Floats, one: Floats) -> None:
     steps, width = tape.shape
     m, floor = total.matrices, tape.dtype.type(-np.inf)
     for layer in range(len(total.layers)):
-        _, _, outputs, inputs, ahead, back, start, source, to, _, _ = columns_of(total, layer)
+        outputs, inputs, ahead, back, start, source, to, _, _ = columns_of(total, layer)
         x, dy = (tape, source, 1), (gradient, to, 1)
         if outputs > inputs:
             out = (m, ahead, outputs + -outputs % PAD)
@@ -250,14 +237,8 @@ def collect(total: Net, tape: Floats, gradient: Floats, one: Floats) -> None:
 @part
 def pack(total: Net, gradient: Floats) -> None:
     """Copy what `collect` has added to the gradient (P,) of the flat weights."""
-    for layer in range(len(total.layers)):
-        weight, bias, outputs, inputs, ahead, back, start, _, _, _, _ = columns_of(total, layer)
-        across, along = outputs + -outputs % PAD, inputs + -inputs % PAD
-        for o in range(outputs):
-            gradient[bias + o] = total.matrices[start + o]
-            for i in range(inputs):
-                at = ahead + i * across + o if outputs > inputs else back + o * along + i
-                gradient[weight + o * inputs + i] = total.matrices[at]
+    for p in range(len(gradient)):
+        gradient[p] = total.matrices[total.places[2, p]]
 
 
 @part

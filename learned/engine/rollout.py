@@ -70,7 +70,7 @@ def descend(moments: Moments, shapes: Shapes, batch: Batch, update: Update) -> O
     truth = _array(batch.truth, theta.dtype)
     if truth.shape != drives.gnss.shape:
         raise InputError("truth", f"shape {truth.shape}", f"must be {drives.gnss.shape}", "Give one position per fix.")
-    gradient, losses = np.empty((models, plan.parameters), truth.dtype), np.empty(models, truth.dtype)
+    gradient, losses = np.empty((models, plan.places.shape[1]), truth.dtype), np.empty(models, truth.dtype)
     outcome = Outcome(gradient, losses, np.empty(models, np.bool_))
     backward.descend(moments, plan, drives, truth, outcome, update)
     return outcome
@@ -83,7 +83,7 @@ def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity:
         raise InputError("theta", actual, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
     steps, lanes = gnss.shape[0], gnss.shape[2]
     wanted = {
-        "theta": (theta, (len(theta), plan_of(shapes).parameters)),
+        "theta": (theta, (len(theta), plan_of(shapes).places.shape[1])),
         "gnss": (gnss, (steps, models, lanes, 3)),
         "velocity": (velocity, (steps, models, lanes, 3)),
         "x0": (x0, (models, lanes, 3)),
