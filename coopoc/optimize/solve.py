@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from ..arrays import Floats, instance
 from ..errors import InputError, MissingLibraryError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES
+from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
-from .backend import MAX_ITERATIONS, Backend, Options, require_backend
+from .backend import MAX_ITERATIONS, Backend, Options, Solver, SolverResult, require_backend
 from .graph_problems import started
 from .model.factor import fused
 from .model.measurements import CONVERTED
@@ -20,7 +22,7 @@ from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import directed, guessed, somewhere, undirected
 from .starts.mirrors import scaled
-from .starts.race import ELSEWHERE, race
+from .starts.race import ELSEWHERE, QUIET_DRAWS, RIVAL_COST, higher, race, rival, scattered
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -98,16 +100,19 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     solver, problem = backend.solver(problem, options), started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
-    if problem.x0 is None and not whole and not problem.constraints:
+    constraints, searching = problem.constraints, problem.x0 is None and not whole
+    problem = problem.replace_unchecked(constraints=())  # which the search for a start leaves to the solver
+    if searching:
         problem = _searched(problem, start)
-        assert problem.x0 is not None
-        start = problem.x0
     built, searched = clock(), problem.search.seconds
     if any(f.loss is not None and (not f.loss.convex or problem.x0 is None) for f in problem.factors):
-        problem = robust_start(problem, start)
-        assert problem.x0 is not None
-        start = problem.x0
-    result, search = solver(problem, start), problem.search
+        problem = robust_start(problem, start if problem.x0 is None else problem.x0)
+    start = start if problem.x0 is None else problem.x0
+    problem = problem.replace_unchecked(constraints=constraints)
+    result = solver(problem, start)
+    if searching and constraints:
+        problem, result = _drawn(problem, solver, result)
+    search = problem.search
     solved = clock()
     x, iterations, infeasible = result.x, result.iterations, result.infeasible
     truth = assess(problem, x, covariance)
@@ -155,6 +160,22 @@ def _searched(problem: Problem, start: Floats) -> Problem:
     began = clock()
     problem, won = race(problem, starts, {"relaxed": relaxed}, lambda x: False, draws=True)
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
+
+
+def _drawn(problem: Problem, solver: Solver, first: SolverResult) -> tuple[Problem, SolverResult]:
+    """The lowest feasible result of a problem with constraints, of the first and those from random places around it;
+    the problem's notes are of the minima that were found."""
+    results = [first, *(solver(problem, y) for y in islice(scattered(problem, first.x), QUIET_DRAWS))]
+    beyond = [max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE) for each in results]
+    costs = [problem.cost(each.x) for each in results]
+    best = min(range(len(results)), key=lambda k: (beyond[k], costs[k]))
+    best = 0 if beyond[best] == beyond[0] and not higher(costs[0], costs[best]) else best
+    least, search = costs[best], problem.search
+    near = [c - least for c, b in zip(costs, beyond, strict=True) if b == FEASIBLE and higher(c, least)]
+    notes = (rival(min(near)),) if min(near, default=np.inf) < RIVAL_COST else ()
+    steps = sum(each.iterations for each in results) - results[best].iterations
+    search = search._replace(start="drawn" if best else search.start, iterations=search.iterations + steps, notes=notes)
+    return problem.replace_unchecked(search=search), results[best]
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:

@@ -82,7 +82,7 @@ def arrive(
     is near, by HESSIAN_SHARE; then the exact Hessian, with which the last steps converge quadratically however large
     the residuals are. Where that is not positive definite J^T J takes over for some steps. mu is the multiplier of a
     trust region |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps
-    are `bounded`, J^T J stays, and the last step is one below the tolerance. A `smooth` descent ends with the first
+    are `bounded`, the last one is below the tolerance. A `smooth` descent ends with the first
     step whose gain ratio is not within 1/2 .. 3/2. An undamped step that raises the cost is taken with the next one
     where both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines.
 
@@ -122,7 +122,7 @@ def arrive(
             dx, push = taken
             predicted = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx + push)
             there = system.retract(x, dx)
-            near = predicted <= HESSIAN_SHARE * cost and against >= 0 and not bounded
+            near = predicted <= HESSIAN_SHARE * cost and against >= 0
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
             after = trial[0]
@@ -150,7 +150,7 @@ def arrive(
             mu = _next(mu, gain)
             if smooth and abs(gain - 1.0) >= NONQUADRATIC:
                 break
-            if not bounded and model == "gauss-newton":
+            if model == "gauss-newton":
                 off = abs(gain - 1.0) > MISMATCH or (record[-1][1] == 0.0 and predicted > SLOW_RATIO * last)
                 against = against + 1 if against < 0 or off else max(against - 1, 0)
                 against = AGAINST if near else against

@@ -197,8 +197,6 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     >>> robust_start(problem, np.array([[99.0, 0, 0]])).search.start
     'graduated'
     """
-    if problem.constraints:
-        return problem
     steps, search = 0, problem.search
     robust = {k: f.loss for k, f in enumerate(problem.factors) if f.loss is not None}
     bare = tuple(unchecked(f, loss=None) for f in problem.factors)

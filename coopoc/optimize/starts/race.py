@@ -96,7 +96,7 @@ def race(
         ends, least = list[tuple[float, Floats]](), system.cost(x)
         drawing = least > limit if draws is None else draws
         most = QUIET_DRAWS if least <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
-        for k, away in enumerate(_away(problem, x) if drawing else ()):
+        for k, away in enumerate(scattered(problem, x) if drawing else ()):
             if k >= most:
                 break
             y = descend(away, LATER_STEPS[-1][1])
@@ -167,7 +167,7 @@ def race(
     return ended(name, x)
 
 
-def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
+def scattered(problem: Problem, x: Floats) -> Iterator[Floats]:
     """Nodes x (n, ambient) moved at random as far as they are from one another: all points, across the plane or line
     that they are nearest to, and one; or bodies, which relative measurements hold together and no pose is measured of,
     all or one, every other time turned alone."""
