@@ -7,7 +7,8 @@ a variance of FLAT m^2.
 """
 
 import copy
-import math
+from math import cos, exp, hypot, inf, log, pi, sin, sqrt
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,7 +65,7 @@ class Belief:
         self.names: list[Name] = []
         self.x, self.p = np.zeros(0), np.zeros((0, 0))
 
-    def at(self, name: Name) -> slice:
+    def at(self, *name: Any) -> slice:
         k = self.names.index(name)
         return slice(3 * k, 3 * k + 3)
 
@@ -78,20 +79,20 @@ class Belief:
     def transform(self, name: Name, terms: dict[Name, float]) -> None:
         """The vector becomes a sum of others."""
         f = np.eye(len(self.x))
-        f[self.at(name)] = 0
+        f[self.at(*name)] = 0
         for other, factor in terms.items():
-            f[self.at(name), self.at(other)] = factor * np.eye(3)
+            f[self.at(*name), self.at(*other)] = factor * np.eye(3)
         self.x, self.p = f @ self.x, f @ self.p @ f.T
 
     def drop(self, name: Name) -> None:
         if name in self.names:
             keep = np.ones(len(self.x), bool)
-            keep[self.at(name)] = False
+            keep[self.at(*name)] = False
             self.names.remove(name)
             self.x, self.p = self.x[keep], self.p[np.ix_(keep, keep)]
 
     def noise(self, name: Name, variance: Any) -> None:
-        at = self.at(name)
+        at = self.at(*name)
         self.p[at, at] += np.diag(np.broadcast_to(variance, 3))
 
     def row(self, terms: dict[Name, Any], axis: int) -> Floats:
@@ -99,9 +100,9 @@ class Belief:
         h = np.zeros(len(self.x))
         for name, factor in terms.items():
             if np.ndim(factor):
-                h[self.at(name)] = np.atleast_2d(factor)[axis if np.ndim(factor) == 2 else 0]
+                h[self.at(*name)] = np.atleast_2d(factor)[axis if np.ndim(factor) == 2 else 0]
             else:
-                h[self.at(name).start + axis] = factor
+                h[self.at(*name).start + axis] = factor
         return h
 
     def update(self, h: Floats, z: float, r: float, gate: float = 0.0) -> float:
@@ -122,12 +123,12 @@ class Belief:
     def average(self, which: list[int], prior: Any, odds: float) -> None:
         """All of these numbers are 0, or N(0, prior)."""
         some = [i for i in which if self.p[i, i] > 0]
-        if not some or odds == -math.inf:
+        if not some or odds == -inf:
             return
         p, m = self.p[np.ix_(some, some)], self.x[some]
         prior = np.broadcast_to(prior, len(which))[[i in some for i in which]]
         odds += 0.5 * (np.log(prior).sum() - np.linalg.slogdet(p)[1] - m @ np.linalg.solve(p, m))
-        none, k = 1 / (1 + math.exp(min(-odds, 700))), np.linalg.solve(p, self.p[some]).T
+        none, k = 1 / (1 + exp(min(-odds, 700))), np.linalg.solve(p, self.p[some]).T
         self.x, self.p = self.x - none * k @ m, self.p - none * k @ (p - (1 - none) * np.outer(m, m)) @ k.T
 
 
@@ -169,18 +170,19 @@ class Oracle:
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
+        self.dt, self.fix, self.u = seen.dt, seen.gnss[run, :, ego], seen.velocity[run, :, ego]
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), np.zeros(3), 1, np.zeros(6)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
             heading, bias = (float(v**2) for v in known.compass)
-            self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
-            keep = math.exp(-seen.dt / s.gnss_drift_time)
+            self.std[1] = sqrt(self.std[1] ** 2 - heading - bias)
+            keep = exp(-seen.dt / s.gnss_drift_time)
             offset, absent = s.range_offset_std**2, np.full(6, priors.absent)
             absent[[2, 3, 5]] = max(priors.absent, 8.0)
-            absent[3:5][[bias > 0, offset > 0]] = -math.inf
+            absent[3:5][[bias > 0, offset > 0]] = -inf
             bias, offset = bias or priors.compass**2, offset or priors.offset**2
-            holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale, priors.clock])
+            holds, turn = exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale, priors.clock])
             ranged, lasting = (
                 np.square([priors.range_scale, priors.pair_offset]),
                 (s.gnss_drift_std**2, s.gnss_common_std**2),
@@ -190,7 +192,6 @@ class Oracle:
         shape = seen.gnss.shape
         self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
         self.remember(seen.gnss[run], seen.velocity[run])
-        self.revoked: dict[int, int]
         self.lone: Any
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
         self.q = heard(seen, self.box, known, run, ego)
@@ -202,198 +203,200 @@ class Oracle:
         self.mean, self.weight, self.odometer = (np.zeros(gnss.shape) for _ in range(3))
         m, w, o = np.zeros((3, *gnss.shape[1:]))
         for t, (z, u) in enumerate(zip(gnss, velocity, strict=True)):
-            moved, there = np.nan_to_num(self.seen.dt * u), np.isfinite(z)
-            w = np.where(np.isnan(u), 0.0, w * math.exp(-self.seen.dt / FADES)) + there / self.r[t]
+            moved, there = np.nan_to_num(self.dt * u), np.isfinite(z)
+            w = np.where(np.isnan(u), 0.0, w * exp(-self.dt / FADES)) + there / self.r[t]
             m, o = m + moved, o + moved
             m = np.where(there, m + (z - m) / np.where(there, self.r[t] * w, 1.0), m)
             self.mean[t], self.weight[t], self.odometer[t] = m, w, o
 
     def reset(self) -> None:
-        self.state, self.revoked, self.lone = self.blank(), {}, None
+        self.state, self.lone = self.blank(), None
         self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
 
-    def blank(self) -> dict[str, Any]:
-        empty: dict[str, Any] = {
-            name: {} for name in ("last", "since", "way", "joined", "hits", "mean", "slot", "pace", "locked")
-        }
-        everyone = set(range(self.seen.gnss.shape[2]))
-        trusted = everyone if not self.priors.fix_gate else {self.ego}
-        numbers = ["made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed"]
-        numbers += ["score", "numbers", "squares", "late", "weight"]
-        levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
-        levels |= {name: np.zeros(3) for name in ("gap", "cov", "course", "recent")} | dict.fromkeys(numbers, 0.0)
-        levels |= {"products": [], "louder": {}, "left": None, "jumped": False, "votes": [], "spread": 0.0}
-        return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
+    def blank(self) -> SimpleNamespace:
+        tables = ("last", "since", "way", "joined", "hits", "mean", "slot", "pace", "locked", "louder", "revoked")
+        numbers = ("made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed", "spread")
+        return SimpleNamespace(
+            **{name: {} for name in tables},
+            **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight"), 0.0),
+            **{name: np.zeros(6) for name in ("level", "learned", "information")},
+            **{name: np.zeros(3) for name in ("gap", "cov", "course", "recent")},
+            **dict.fromkeys(("left", "unused")),
+            **{name: [] for name in ("products", "votes", "members")},
+            belief=Belief(),
+            jumped=False,
+            vague=set(),
+            trusted={self.ego} if self.priors.fix_gate else set(range(self.seen.gnss.shape[2])),
+        )
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
         """x (T, 3), covariance (T, 3, 3), neighbours (k, 3) of each step."""
         found: list[Any] = []
         for t in range(len(self.seen.t)):
-            fix, u = self.seen.gnss[self.run, t, self.ego], self.seen.velocity[self.run, t, self.ego]
-            if np.isnan(u[0]) or not (self.state["belief"].names or self.places(t, fix, *self.heard(t)[1:])):
+            fix, u = self.fix[t], self.u[t]
+            self.gather(t)
+            if np.isnan(u[0]) or not (self.state.belief.names or self.places(t, fix)):
                 self.reset()
                 found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
                 continue
-            if not self.state["belief"].names:
+            if not self.state.belief.names:
                 self.begin(t)
             if self.priors.forget and self.lone is None and self.neighbours(t)[1]:
-                self.lone = copy.deepcopy((self.state, self.revoked))
+                self.lone = copy.deepcopy(self.state)
             self.tries(t)
             self.remember_error(t)
             x, cov = self.compare(t, *self.answer())
             more, white = max(self.lasting(t) - np.trace(cov), 0.0), self.r[t, self.ego] * self.white
             here = x, cov + more * np.diag(white / white.sum())
-            b, way = self.state["belief"], self.state["way"]
-            at = [b.x[b.at(("x", j))] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
+            b, way = self.state.belief, self.state.way
+            at = [b.x[b.at("x", j)] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
             found.append((*here, at))
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
 
     def remember_error(self, t: int) -> None:
-        s, b = self.state, self.state["belief"]
-        s["late"] += self.seen.dt
-        if s["share"] < 1:
+        s, b = self.state, self.state.belief
+        s.late += self.dt
+        if s.share < 1:
             return
-        states = [b.x[b.at(name)] for name in self.fix_terms(self.ego)]
-        error, keep = self.seen.gnss[self.run, t, self.ego] - sum(states), math.exp(-min(s["late"], 1.0))
-        if s["weight"]:
-            s["products"] = [*s["products"], (t, error @ s["recent"] / s["weight"])]
-        s["recent"], s["weight"], s["late"] = keep * s["recent"] + error, keep * s["weight"] + 1, 0.0
+        states = [b.x[b.at(*name)] for name in self.fix_terms(self.ego)]
+        error, keep = self.fix[t] - sum(states), exp(-min(s.late, 1.0))
+        if s.weight:
+            s.products = [*s.products, (t, error @ s.recent / s.weight)]
+        s.recent, s.weight, s.late = keep * s.recent + error, keep * s.weight + 1, 0.0
 
     def lasting(self, t: int) -> float:
-        if not (self.priors.forget and self.state["products"]):
+        if not (self.priors.forget and self.state.products):
             return 0.0
-        when, p = np.array(self.state["products"]).T
-        w, seconds = np.exp(-(t - when) * self.seen.dt / 100), (t - self.state["began"]) * self.seen.dt
+        when, p = np.array(self.state.products).T
+        w, seconds = np.exp(-(t - when) * self.dt / 100), (t - self.state.began) * self.dt
         n = max(w.sum(), 1.0)
         c, error = w @ p / n, w @ p**2 / n * max(2 / np.clip(seconds, 1, 100), 1 / n)
         return float(max(c - error / c, 0.0)) if c > 0 else 0.0
 
     def answer(self) -> tuple[Floats, Floats]:
         """Position and covariance, averaged over which errors are there."""
-        b = copy.deepcopy(self.state["belief"])
+        b = copy.deepcopy(self.state.belief)
         self.average(b)
-        x = b.at(("x", self.ego))
-        self.state["cov"] = np.diag(b.p[x, x])
+        x = b.at("x", self.ego)
+        self.state.cov = np.diag(b.p[x, x])
         return b.x[x], b.p[x, x]
 
     def compare(self, t: int, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
         """Beside the star, the ego alone: whose answer counts?"""
         if self.lone is None:
             return x, cov
-        fix, dt, before = self.seen.gnss[self.run, t, self.ego], self.seen.dt, (self.state, self.revoked)
-        if self.state.get("unused") == t:
+        fix, dt, before = self.fix[t], self.dt, self.state
+        if self.state.unused == t:
             fix = np.full(3, np.nan)
-        level = max(self.state["level"][:3])
-        (self.state, self.revoked), self.deaf = self.lone, True
+        level = max(self.state.level[:3])
+        self.state, self.deaf = self.lone, True
         self.pace(t)
         self.corrected_now, self.grown = self.pending == KNOWN, self.more[t]
         self.step(t, 0.0)
         self.corrected_now = False
         y, q = self.answer()
-        self.lone, (self.state, self.revoked), self.deaf = (self.state, self.revoked), before, False
+        self.lone, self.state, self.deaf = self.state, before, False
         self.left -= dt
         if np.isfinite(fix).all():
             r = self.r[t, self.ego] * self.white
             star, lone = (min(((fix - at) ** 2 / (r + np.diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
-            self.doubts = math.exp(-dt / 10) * self.doubts + [star - lone, 1]
-            _, messages, relative = self.heard(t)
-            star, lone = (sum(self.off(t, at, messages, relative)) for at in (x, y))
-            self.alike = math.exp(-dt / 10) * self.alike + star - lone
+            self.doubts = exp(-dt / 10) * self.doubts + [star - lone, 1]
+            self.gather(t)
+            star, lone = (sum(self.off(t, at)) for at in (x, y))
+            self.alike = exp(-dt / 10) * self.alike + star - lone
             if (level > 2.9 or self.alike > 20) and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
-                self.state, self.revoked = copy.deepcopy(self.lone)
+                self.state = copy.deepcopy(self.lone)
                 self.doubts, self.last, self.alike = np.zeros(2), max(2 * self.last, 20.0), 0.0
                 self.left = self.last
         if self.left > 0:
             x, cov = y, q
-        self.state["cov"] = np.diag(cov)
+        self.state.cov = np.diag(cov)
         return x, cov
 
     def average(self, b: Belief) -> None:
-        life, slot = self.life, self.state["slot"]
-        members = sorted((self.ego, *self.state["members"]), key=lambda j: -slot[j])
-        turns = [b.at(("o", j)).start + i for j in members if ("o", j) in b.names for i in range(3)]
+        life, slot = self.life, self.state.slot
+        members = sorted((self.ego, *self.state.members), key=lambda j: -slot[j])
+        turns = [b.at("o", j).start + i for j in members if ("o", j) in b.names for i in range(3)]
         for k, i in enumerate(turns):
             b.average([i], life.turn[k % 3], life.absent[k % 3])
         if ("compass",) in b.names:
-            b.average([b.at(("compass",)).start], life.bias, life.absent[3])
-            b.average([b.at(("compass",)).start + 2], life.offset, life.absent[4])
+            b.average([b.at("compass").start], life.bias, life.absent[3])
+            b.average([b.at("compass").start + 2], life.offset, life.absent[4])
         if ("r", self.ego) in b.names:
-            b.average([b.at(("r", self.ego)).start], life.ranged[0], life.absent[5])
-        if life.absent[0] == -math.inf:
+            b.average([b.at("r", self.ego).start], life.ranged[0], life.absent[5])
+        if life.absent[0] == -inf:
             turns = [i for k, i in enumerate(turns) if k % 3 < 2]
             b.average(turns, np.tile(life.turn[:2], len(members)), self.priors.exact * max(len(members), 2))
 
     def motion(self, t: int) -> tuple[Floats, Floats]:
         """The ego's velocity and the variance of its motion, corrected by fixes or not."""
-        u, q = self.seen.velocity[self.run, t, self.ego], self.q[t, self.ego]
+        u, q = self.u[t], self.q[t, self.ego]
         return (u, q + self.grown) if self.corrected_now else (u - self.by[t], q)
 
     def pace(self, t: int) -> None:
         """The most of late speeds, and its direction."""
-        dt, u = self.seen.dt, self.seen.velocity[self.run, t, self.ego]
-        speed, late = float(np.linalg.norm(u)), self.state["speed"] * math.exp(-dt / SPEED_MEMORY)
-        self.state["blind"] += dt
+        dt, u = self.dt, self.u[t]
+        speed, late = float(np.linalg.norm(u)), self.state.speed * exp(-dt / SPEED_MEMORY)
+        self.state.blind += dt
         if speed > 0.5 * late:
-            self.state |= {"course": u / speed, "blind": 0.0}
-        self.state["speed"] = max(speed, late)
+            self.state.course, self.state.blind = u / speed, 0.0
+        self.state.speed = max(speed, late)
 
     def tries(self, t: int) -> None:
         """A step, and perhaps one that slips."""
-        share, dt = self.priors.slip * (self.known.sensors is not None), self.seen.dt
+        share, dt = self.priors.slip * (self.known.sensors is not None), self.dt
         self.pace(t)
         more = self.more[t]
         self.pending = 0.0 if more == 0 else KNOWN if self.pending == KNOWN else self.pending + more
-        before = copy.deepcopy((self.state, self.revoked)) if share else None
+        before = copy.deepcopy(self.state) if share else None
         self.step(t, 0.0)
-        n, p = self.state["numbers"], self.state["slips"]
+        n, p = self.state.numbers, self.state.slips
         known, fails = self.pending == KNOWN, self.pending > 0
-        strange = (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)) and (
-            fails or known or not self.state["jumped"]
-        )
+        strange = (p > 0.1 or self.state.squares > n + sqrt(2 * n)) and (fails or known or not self.state.jumped)
         if before is None or not strange:
-            self.state["slips"] *= 0.0 if n else math.exp(-dt / SLIP_LASTS)
+            self.state.slips *= 0.0 if n else exp(-dt / SLIP_LASTS)
             return
-        first, (self.state, self.revoked) = (self.state, self.revoked), before
-        rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white + self.state["shown"] ** 2
+        first, self.state = self.state, before
+        rate, shows = (share * self.state.speed) ** 2, self.r[t, self.ego] @ self.white + self.state.shown**2
         self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
         self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         self.corrected_now = False
-        prior = p * (1.0 if known else math.exp(-dt / SLIP_LASTS)) + (1 - p) * min(
+        prior = p * (1.0 if known else exp(-dt / SLIP_LASTS)) + (1 - p) * min(
             dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5
         )
-        odds = self.state["score"] - first[0]["score"] + (DECISIVE if fails else math.log(prior / (1 - prior)))
+        odds = self.state.score - first.score + (DECISIVE if fails else log(prior / (1 - prior)))
         if odds < 0:
-            self.state, self.revoked = first
+            self.state = first
         elif fails:
             self.pending = KNOWN
-        self.state["slips"] = 1 / (1 + math.exp(min(-odds, 700)))
+        self.state.slips = 1 / (1 + exp(min(-odds, 700)))
 
-    def count(self, q: float, log: float, numbers: int) -> None:
+    def count(self, q: float, logdet: float, numbers: int) -> None:
         """What the numbers of an update say of a slip."""
-        self.state["score"] -= 0.5 * (q + log)
-        self.state["numbers"] += numbers
-        self.state["squares"] += q
+        self.state.score -= 0.5 * (q + logdet)
+        self.state.numbers += numbers
+        self.state.squares += q
 
     def neighbours(self, t: int) -> tuple[Any, list[int]]:
         """Links of a step, and the columns that they join."""
         here = np.arange(self.box.start[t], self.box.start[t + 1])
         return here, self.seen.links.neighbour[self.box.link[here]].tolist()
 
-    def heard(self, t: int) -> tuple[list[int], dict[int, Any], dict[int, Floats]]:
-        """Neighbours of a step, the messages that are held, and what is measured."""
+    def gather(self, t: int) -> None:
+        """The messages of neighbours that are held at a step, and what is measured of them."""
         here, others = (np.empty(0, int), []) if self.deaf else self.neighbours(t)
         links = dict(zip(others, here.tolist(), strict=True))
-        relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
-        return others, {j: self.message(link, j) for j, link in links.items()}, relative
+        self.relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
+        self.messages = {j: self.message(link, j) for j, link in links.items()}
 
-    def places(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> list[Any]:
+    def places(self, t: int, fix: Floats) -> list[Any]:
         """Where the ego may be, and the variance: by its fix, and by each neighbour."""
         found = [(fix.copy(), self.r[t, self.ego])] if np.isfinite(fix).all() else []
-        for j, message in messages.items():
-            if message is not None and np.isfinite(relative[j]).all() and message.weight.all():
-                late = (t - message.step) * self.seen.dt * message.velocity
-                found.append((message.mean + late - to_vector(relative[j]), 1 / message.weight + 1))
+        for j, message in self.messages.items():
+            if message is not None and np.isfinite(self.relative[j]).all() and message.weight.all():
+                late = (t - message.step) * self.dt * message.velocity
+                found.append((message.mean + late - to_vector(self.relative[j]), 1 / message.weight + 1))
         return found
 
     def message(self, link: int, j: int) -> Sent | None:
@@ -406,28 +409,28 @@ class Oracle:
 
     def louder(self, j: int) -> float:
         """Level of a vehicle's motion."""
-        s, few = self.state, self.state["mean"].get(j, (0.0, 0.0))[0] < AGREEING
-        doubted = few and j in s["last"] and j not in s["trusted"] and j != self.ego
-        return (UNTRUSTED if doubted else 1.0) * math.exp(s["level"][5]) * float(s["louder"].get(j, 1.0))
+        s, few = self.state, self.state.mean.get(j, (0.0, 0.0))[0] < AGREEING
+        doubted = few and j in s.last and j not in s.trusted and j != self.ego
+        return (UNTRUSTED if doubted else 1.0) * exp(s.level[5]) * float(s.louder.get(j, 1.0))
 
     def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
         """What innovations show of a level: derivative and information of their log-likelihood."""
-        self.state["learned"][kind] += 0.5 * numbers * share * more
-        self.state["information"][kind] += 0.5 * numbers * share**2
+        self.state.learned[kind] += 0.5 * numbers * share * more
+        self.state.information[kind] += 0.5 * numbers * share**2
 
     def own_variance(self) -> Any:
-        at = self.state["belief"].at(("x", self.ego))
-        return np.diag(self.state["belief"].p)[at].sum()
+        at = self.state.belief.at("x", self.ego)
+        return np.diag(self.state.belief.p)[at].sum()
 
     def corrected(self) -> None:
         """What the level of motion makes of the ego's variance, after an update."""
         s, now = self.state, self.own_variance()
-        s["made"] = min(s["made"] * (now / s["whole"]) ** 2, now)
-        s["whole"] = now
+        s.made = min(s.made * (now / s.whole) ** 2, now)
+        s.whole = now
 
     def begin(self, t: int) -> None:
         """The first step."""
-        s, b, life = self.state, self.state["belief"], self.life
+        s, b, life = self.state, self.state.belief, self.life
         b.add(("x", self.ego), 0.0, 0.0)
         if life.common:
             b.add(("common",), 0, life.common)
@@ -436,142 +439,138 @@ class Oracle:
         if life.ranged[0]:
             b.add(("r", self.ego), 0, [life.ranged[0], 0, 0])
         self.add_turn(self.ego)
-        s["slot"][self.ego], s["began"] = 0, t
-        s["trusted"].add(self.ego)
-        self.start(t, self.seen.gnss[self.run, t, self.ego].copy(), *self.heard(t)[1:])
+        s.slot[self.ego], s.began = 0, t
+        s.trusted.add(self.ego)
+        self.start(t, self.fix[t].copy())
 
     def step(self, t: int, slip: float) -> None:
-        self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0, "share": 0.0}
-        s, g, b = self.state, self.priors, self.state["belief"]
-        others, messages, relative = self.heard(t)
+        s, g, b = self.state, self.priors, self.state.belief
+        s.score = s.numbers = s.squares = s.share = 0.0
+        self.gather(t)
+        others, messages, relative = [*self.messages], self.messages, self.relative
         louder = self.louder(self.ego)
-        fix = self.seen.gnss[self.run, t, self.ego].copy()
-        if s.get("unused") == t:
+        fix = self.fix[t].copy()
+        if s.unused == t:
             fix[:] = np.nan
-        seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix, messages, relative)
+        seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix)
         if outvoted:
-            s["trusted"].add(self.ego)
-        again = bool(g.fix_gate) and t > s["began"] and seen
-        again = again and (outvoted or self.lost(t)) and self.start(t, fix, messages, relative)
-        for j in list(s["members"]):
+            s.trusted.add(self.ego)
+        again = bool(g.fix_gate) and t > s.began and seen
+        again = again and (outvoted or self.lost(t)) and self.start(t, fix)
+        for j in list(s.members):
             if j not in others or again or self.contradicted(t, j):
                 self.dismiss(j, j in others, outvoted)
-        dt = self.seen.dt
-        s["agreed"] += dt * (s["hits"].get("fix", 0) == 0)
-        s["unseen"] += dt
+        dt = self.dt
+        s.agreed += dt * (s.hits.get("fix", 0) == 0)
+        s.unseen += dt
         u, q = self.motion(t)
         u, q = self.steady(t, self.ego, u, louder * q)
-        if t > s["joined"][self.ego]:
+        if t > s.joined[self.ego]:
             self.predict(dt * u, q)
-            x = b.at(("x", self.ego))
-            across = min(SIDEWAYS + (TURNS * s["blind"]) ** 2, 1.0)
-            b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
-        s["made"] = s["made"] + q.sum()
-        if s["left"]:
-            grown = 0.0 if self.ego in s["vague"] else self.own_variance() - s["whole"]
+            x = b.at("x", self.ego)
+            across = min(SIDEWAYS + (TURNS * s.blind) ** 2, 1.0)
+            b.p[x, x] += slip * (across * np.eye(3) + np.outer(s.course, s.course))
+        s.made = s.made + q.sum()
+        if s.left:
+            grown = 0.0 if self.ego in s.vague else self.own_variance() - s.whole
             grown, way = max(grown, q.sum()), 0.0
             if slip:
                 corrections = louder * self.grown if self.corrected_now else 0.0
                 grown, way = max(q.sum() - 3 * corrections, 0.0), self.by[t] * dt if self.corrected_now else 0.0
-            s["left"] = s["left"][0] - way, s["left"][1] + grown / 3
-        s["whole"] = self.own_variance()
-        for j in [j for j in others if j not in s["members"]]:
-            self.join(t, j, messages[j], relative[j])
+            s.left = s.left[0] - way, s.left[1] + grown / 3
+        s.whole = self.own_variance()
+        for j in [j for j in others if j not in s.members]:
+            self.join(t, j)
         if np.isfinite(fix).all():
-            self.add_fix(t, fix, messages, relative)
-        at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
-        for j in sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego]))):
-            new = j in s["vague"] and messages[j] is not None
-            if not (new and g.fix_gate and np.isfinite(relative[j]).all()):
-                messages[j] = self.receive(t, j, messages[j], relative[j])
-            s["way"][j] = self.goes_on(t, j, messages[j])[0]
-        at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
-        order = sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
-        self.measure(t, at, order, relative, messages)
+            self.add_fix(t, fix)
+        for j in self.nearest()[1]:
+            new = j in s.vague and messages[j] is not None
+            if new and g.fix_gate and np.isfinite(relative[j]).all():
+                s.way[j] = self.goes_on(t, j)[0]
+            else:
+                self.take(t, j)
+        at, order = self.nearest()
+        self.measure(t, at, order)
         for j in order:
-            messages[j] = self.receive(t, j, messages[j], relative[j])
-            s["way"][j] = self.goes_on(t, j, messages[j])[0]
+            self.take(t, j)
         if g.fix_gate:
             self.trust()
         self.corrected()
         if g.forget:
-            step = np.clip(s["learned"] / (s["information"] + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
-            s["level"] = np.clip(s["level"] + step, MIN_LEVEL, MAX_LEVEL)
-        s["learned"] = np.zeros(6)
-        s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
+            step = np.clip(s.learned / (s.information + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
+            s.level = np.clip(s.level + step, MIN_LEVEL, MAX_LEVEL)
+        s.learned = np.zeros(6)
+        s.information = s.information * (exp(-dt / g.forget) if g.forget else 1.0)
+
+    def nearest(self) -> tuple[dict[int, Floats], list[int]]:
+        """Where ego and members are now, and the members, nearest first."""
+        s, b = self.state, self.state.belief
+        at = {j: b.x[b.at("x", j)] + s.way.get(j, 0.0) for j in (self.ego, *s.members)}
+        return at, sorted(s.members, key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
 
     def dismiss(self, j: int, measured: bool, doubted: bool) -> None:
-        if measured and (doubted or j not in self.state["trusted"]):
+        if measured and (doubted or j not in self.state.trusted):
             self.doubt(j)
         for kind in "xbor":
-            self.state["belief"].drop((kind, j))
-        self.state["members"].remove(j)
+            self.state.belief.drop((kind, j))
+        self.state.members.remove(j)
 
-    def add_fix(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> None:
-        s, louder = self.state, math.exp(self.state["level"][3])
+    def add_fix(self, t: int, fix: Floats) -> None:
+        s, louder = self.state, exp(self.state.level[3])
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
-        if self.ego not in s["vague"]:
+        if self.ego not in s.vague:
             self.learn_fix(3, rows)
-            _, gap, _, r = self.mahalanobis(s["belief"], rows)
-            far, most = float(np.linalg.norm(gap)), s["speed"] * s["unseen"] + 2 * math.sqrt(r.sum())
-            more = far - float(np.linalg.norm(s["gap"]))
-            if more > most or far < 2 * math.sqrt(r.sum()):
-                s["jumped"] = more > most
-            s["shown"], s["gap"], s["unseen"] = max(s["shown"] + min(more, most), 0.0), gap, 0.0
-        if self.priors.fix_gate and self.ego not in s["vague"]:
-            self.go_back(t, fix, rows, messages, relative)
+            _, gap, _, r = self.mahalanobis(s.belief, rows)
+            far, most = float(np.linalg.norm(gap)), s.speed * s.unseen + 2 * sqrt(r.sum())
+            more = far - float(np.linalg.norm(s.gap))
+            if more > most or far < 2 * sqrt(r.sum()):
+                s.jumped = more > most
+            s.shown, s.gap, s.unseen = max(s.shown + min(more, most), 0.0), gap, 0.0
+        if self.priors.fix_gate and self.ego not in s.vague:
+            self.go_back(t, fix, rows)
             rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
-        s["share"] = share = self.use_fix(t, self.ego, rows, True)
-        s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
+        s.share = share = self.use_fix(t, self.ego, rows, True)
+        s.hits["fix"] = s.hits["fix"] + 1 if share < 1 else 0
         self.corrected()
 
-    def go_back(self, t: int, fix: Floats, rows: list[Any], messages: Any, relative: dict[int, Floats]) -> None:
+    def go_back(self, t: int, fix: Floats, rows: list[Any]) -> None:
         """To where the ego was before fixes contradicted it, if it is there again."""
-        s, b = self.state, self.state["belief"]
+        s, b = self.state, self.state.belief
         q, gap, cov, r = self.mahalanobis(b, rows)
-        gate, at = max(self.priors.fix_gate, FIX_GATE), b.at(("x", self.ego))
-        s["agree"] = 0.0 if q > gate else s["agree"] + float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
-        if not s["left"]:
+        gate, at = max(self.priors.fix_gate, FIX_GATE), b.at("x", self.ego)
+        s.agree = 0.0 if q > gate else s.agree + float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
+        if not s.left:
             if q > gate:
-                s["left"], s["evidence"] = (b.x[at].copy(), np.trace(b.p[at, at]) / 3), 0.0
-                s["driven"] = 0.0
+                s.left, s.evidence = (b.x[at].copy(), np.trace(b.p[at, at]) / 3), 0.0
+                s.driven = 0.0
             return
-        (x, p), most = s["left"], HARD_REJECT_FACTOR * gate
-        if ("o", self.ego) in b.names and self.life.absent[0] == -math.inf:
-            p += s["driven"] ** 2 * np.diag(b.p)[b.at(("o", self.ego))].sum() / 3
+        (x, p), most = s.left, HARD_REJECT_FACTOR * gate
+        if ("o", self.ego) in b.names and self.life.absent[0] == -inf:
+            p += s.driven**2 * np.diag(b.p)[b.at("o", self.ego)].sum() / 3
         other = ((fix - x) ** 2 / (p + r + SLIP)).sum()
-        s["evidence"] = 0.0 if other > gate else max(s["evidence"] + min(q, most) - other, 0.0)
+        s.evidence = 0.0 if other > gate else max(s.evidence + min(q, most) - other, 0.0)
         near = np.square(b.x[at] - x + np.diag(cov) / (np.diag(cov) + r) * gap).sum() < 3 * p
-        if not near and s["evidence"] > EVIDENCE * most:
-            if self.speak_for(t, b.x[at], x, messages, relative) > 0:
+        if not near and s.evidence > EVIDENCE * most:
+            if self.speak_for(t, b.x[at], x) > 0:
                 return
-            for j in list(s["members"]):
-                self.dismiss(j, j in messages, False)
-            b.drop(("b", self.ego))
-            if self.life.own:
-                b.add(("b", self.ego), 0, self.life.own)
-            s["trusted"].add(self.ego)
-            s["mean"].pop(self.ego, None)
-            at = b.at(("x", self.ego))
-            b.transform(("x", self.ego), {})
-            b.x[at] = x
-            b.noise(("x", self.ego), p)
-            s["locked"].pop(self.ego, None)
-            s["left"] = None
-        elif near and s["agree"] > AWAY:
-            s["left"] = None
+            for j in list(s.members):
+                self.dismiss(j, j in self.messages, False)
+            self.place(x, p)
+            s.left = None
+        elif near and s.agree > AWAY:
+            s.left = None
 
     def learn_fix(self, kind: int, rows: list[Any]) -> None:
-        _, gap, cov, r = self.mahalanobis(self.state["belief"], rows)
+        _, gap, cov, r = self.mahalanobis(self.state.belief, rows)
         total = np.trace(cov) + r.sum()
         square = gap @ gap
         wild = kind == 3 and square > SUDDEN * total
         s = self.state
-        displaced = wild and (s["agreed"] < ESTABLISHED or s["locked"].get(self.ego, 0.0) < MAX_LOCKOUT)
-        more = min((np.square(gap - s["gap"]).sum() / 2 if displaced else square) / total, SUDDEN) - 1.0
+        displaced = wild and (s.agreed < ESTABLISHED or s.locked.get(self.ego, 0.0) < MAX_LOCKOUT)
+        more = min((np.square(gap - s.gap).sum() / 2 if displaced else square) / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
         if kind == 3 and not wild:
-            self.learn(5, more, self.state["made"] / total, 3)
+            self.learn(5, more, self.state.made / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
@@ -582,32 +581,32 @@ class Oracle:
 
     def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> float:
         """The share of its information that is used; trust may be revoked."""
-        s, g, b = self.state, self.priors, self.state["belief"]
+        s, g, b = self.state, self.priors, self.state.belief
         used = [c for c, row in enumerate(rows) if row is not None]
         h = np.array([b.row(rows[c][0], c) for c in used])
         z, r = (np.array([rows[c][i] for c in used]) for i in (1, 2))
         if not used:
             return 1.0
-        if j in s["vague"] and len(used) == 3:
+        if j in s.vague and len(used) == 3:
             b.updates(h, z, r)
-            s["vague"].discard(j)
+            s.vague.discard(j)
             return 1.0
-        judged = j != self.ego or any(i in s["last"] for i in s["members"])
+        judged = j != self.ego or any(i in s.last for i in s.members)
         if g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows)):
-            if j in s["trusted"]:
-                self.revoked[j] = self.revoked.get(j, 0) + 1
+            if j in s.trusted:
+                s.revoked[j] = s.revoked.get(j, 0) + 1
             self.doubt(j)
             if j == self.ego:
-                s["locked"][j] = 0.0
+                s.locked[j] = 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
-        mine, noise, locked = np.trace(own), r.sum(), s["locked"]
+        mine, noise, locked = np.trace(own), r.sum(), s.locked
         if not judged:
-            mine, noise = s["cov"].sum(), noise * math.exp(-s["level"][3])
+            mine, noise = s.cov.sum(), noise * exp(-s.level[3])
         gain = mine / (mine + noise)
         q = min(square, float(gap @ gap) / SLIP)
         share, hits = 1.0, locked.get(j, 0.0)
@@ -615,7 +614,7 @@ class Oracle:
             if q > g.fix_gate and hits < PATIENCE:
                 share = g.fix_gate / q if q < HARD_REJECT_FACTOR * g.fix_gate else 0.0
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
-            if not judged and s["agreed"] >= ESTABLISHED:
+            if not judged and s.agreed >= ESTABLISHED:
                 locked[j] = min(locked[j], MAX_LOCKOUT)
         if share:
             b.updates(h, z, r, share=share)
@@ -624,154 +623,160 @@ class Oracle:
     def wrong(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """On average, or locked out, the ego beside a neighbour that is trusted."""
         s = self.state
-        trusted = any(i in s["last"] and i in s["trusted"] for i in s["members"])
-        locked = q > self.priors.fix_gate and s["locked"].get(j, 0.0) >= PATIENCE and (j != self.ego or trusted)
+        trusted = any(i in s.last and i in s.trusted for i in s.members)
+        locked = q > self.priors.fix_gate and s.locked.get(j, 0.0) >= PATIENCE and (j != self.ego or trusted)
         return self.wrong_on_average(j, q, gap, cov, r) or locked
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
         s, g = self.state, self.priors
-        count, mean = s["mean"].get(j, (0.0, np.zeros(3)))
+        count, mean = s.mean.get(j, (0.0, np.zeros(3)))
         count = min(count + 1, WINDOW)
-        s["mean"][j] = count, mean
-        if j not in s["trusted"] and q > max(g.fix_gate, FIX_GATE):
+        s.mean[j] = count, mean
+        if j not in s.trusted and q > max(g.fix_gate, FIX_GATE):
             return True
-        mean = mean + (gap * min(1.0, math.sqrt(CLIP / q)) - mean) / count
-        s["mean"][j] = count, mean
+        mean = mean + (gap * min(1.0, sqrt(CLIP / q)) - mean) / count
+        s.mean[j] = count, mean
         v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
-        odds = math.log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
+        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
         near = mean @ np.linalg.solve(v, mean)
-        enough = near >= 2 * (math.log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
+        enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
         return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
 
     def doubt(self, j: int) -> None:
         s = self.state
-        s["trusted"].discard(j)
-        s["mean"].pop(j, None)
-        if ("x", j) in s["belief"].names:
-            s["belief"].drop(("b", j))
-            s["belief"].add(("b", j), 0.0, TAU**2 + self.life.own)
+        s.trusted.discard(j)
+        s.mean.pop(j, None)
+        if ("x", j) in s.belief.names:
+            s.belief.drop(("b", j))
+            s.belief.add(("b", j), 0.0, TAU**2 + self.life.own)
 
-    def start(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
+    def start(self, t: int, fix: Floats) -> bool:
         """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""
-        s, g, b = self.state, self.priors, self.state["belief"]
-        places, votes = self.places(t, fix, messages, relative), [1]
+        s, g = self.state, self.priors
+        places, votes = self.places(t, fix), [1]
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
         elsewhere = np.isnan(fix[0]) or (votes[0] <= 1 and max(votes) >= 2)
-        if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2):
+        if self.ego not in s.trusted and votes[0] < max(len(votes), 2):
             return False
-        b.drop(("b", self.ego))
-        b.transform(("x", self.ego), {})
-        if self.life.own:
-            b.add(("b", self.ego), 0, self.life.own)
-        b.noise(("x", self.ego), FLAT)
-        b.x[b.at(("x", self.ego))] = places[best if elsewhere else 0][0]
-        s["joined"][self.ego], s["hits"]["fix"] = t, 0
-        s["locked"].pop(self.ego, None)
-        if s["left"]:
-            moved = self.seen.dt * self.motion(t)[0]
-            s["left"] = s["left"][0] + moved, s["left"][1]
-        s["agreed"] = 0.0
-        s["trusted"].add(self.ego)
-        s["mean"].pop(self.ego, None)
-        s["vague"].add(self.ego)
+        self.place(places[best if elsewhere else 0][0], FLAT)
+        s.joined[self.ego], s.hits["fix"] = t, 0
+        if s.left:
+            moved = self.dt * self.motion(t)[0]
+            s.left = s.left[0] + moved, s.left[1]
+        s.agreed = 0.0
+        s.vague.add(self.ego)
         if elsewhere:
-            fix[:], s["unused"] = np.nan, t
-            s["vague"].discard(self.ego)
+            fix[:], s.unused = np.nan, t
+            s.vague.discard(self.ego)
         return True
 
-    def outvoted(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
+    def place(self, x: Floats, variance: Any) -> None:
+        """The ego anew, whose fixes are trusted."""
+        s, b = self.state, self.state.belief
+        b.drop(("b", self.ego))
+        if self.life.own:
+            b.add(("b", self.ego), 0, self.life.own)
+        b.transform(("x", self.ego), {})
+        b.x[b.at("x", self.ego)] = x
+        b.noise(("x", self.ego), variance)
+        s.trusted.add(self.ego)
+        s.mean.pop(self.ego, None)
+        s.locked.pop(self.ego, None)
+
+    def outvoted(self, t: int, fix: Floats) -> bool:
         """Do more fixes agree with one another elsewhere than with the start, and no more neighbours with that?"""
-        votes, r, (u, q) = self.state["votes"], self.r[t, self.ego] * self.white, self.motion(t)
+        votes, r, (u, q) = self.state.votes, self.r[t, self.ego] * self.white, self.motion(t)
         if votes and votes[0][1] >= CONFIRMED:
             return False
         for at in votes:
-            at[0] += self.seen.dt * u
-        self.state["spread"] = self.state["spread"] + q.mean() if votes else 0.0
+            at[0] += self.dt * u
+        self.state.spread = self.state.spread + q.mean() if votes else 0.0
         if np.isnan(fix).any():
             return False
         for at in votes:
-            if ((fix - at[0]) ** 2 / (2 * r + self.state["spread"] + SLIP)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
+            if ((fix - at[0]) ** 2 / (2 * r + self.state.spread + SLIP)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
                 at[1] += 1
                 break
         else:
             votes[1:] = [[fix.copy(), 1]]
         if votes[-1][1] <= votes[0][1]:
             return False
-        votes[:], self.state["spread"] = [[fix.copy(), votes[1][1]], votes[0]], 0.0
-        b = self.state["belief"]
-        return self.speak_for(t, b.x[b.at(("x", self.ego))] + self.seen.dt * u, fix, messages, relative) <= 0
+        votes[:], self.state.spread = [[fix.copy(), votes[1][1]], votes[0]], 0.0
+        b = self.state.belief
+        return self.speak_for(t, b.x[b.at("x", self.ego)] + self.dt * u, fix) <= 0
 
-    def speak_for(self, t: int, here: Floats, there: Floats, messages: Any, relative: dict[int, Floats]) -> int:
+    def speak_for(self, t: int, here: Floats, there: Floats) -> int:
         """How many more neighbours put the ego at one place than at another?"""
-        near = [sum(q < FIX_GATE for q in self.off(t, at, messages, relative)) for at in (here, there)]
+        near = [sum(q < FIX_GATE for q in self.off(t, at)) for at in (here, there)]
         return near[0] - near[1]
 
-    def off(self, t: int, place: Floats, messages: Any, relative: dict[int, Floats]) -> list[float]:
+    def off(self, t: int, place: Floats) -> list[float]:
         """How far is a place from where each neighbour puts the ego?"""
-        std, found = self.std * np.exp(self.state["level"][:3] / 2), []
-        for j, message in messages.items():
-            if message is None or np.isnan(relative[j][0]):
+        std, found = self.std * np.exp(self.state.level[:3] / 2), []
+        for j, message in self.messages.items():
+            relative = self.relative[j]
+            if message is None or np.isnan(relative[0]):
                 continue
             with np.errstate(divide="ignore"):
                 r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
-            gap = message.mean + (t - message.step) * self.seen.dt * message.velocity - place
-            q = (np.linalg.norm(gap) - relative[j][0]) ** 2 / r
-            if np.isfinite(relative[j]).all():
-                q = np.square(gap - to_vector(relative[j])).sum() / (r + std[1] ** 2 * gap @ gap)
+            gap = message.mean + (t - message.step) * self.dt * message.velocity - place
+            q = (np.linalg.norm(gap) - relative[0]) ** 2 / r
+            if np.isfinite(relative).all():
+                q = np.square(gap - to_vector(relative)).sum() / (r + std[1] ** 2 * gap @ gap)
             found.append(min(float(q), FIX_GATE))
         return found
 
     def lost(self, t: int) -> bool:
         s = self.state
-        held = [j for j in s["members"] if j in s["last"]]
-        if any(j in s["trusted"] for j in held):
+        held = [j for j in s.members if j in s.last]
+        if any(j in s.trusted for j in held):
             return False
-        if self.ego in s["trusted"]:
-            return bool(s["hits"]["fix"] > 0 and s["locked"].get(self.ego, 0.0) >= PATIENCE)
-        b, noise = s["belief"], (self.r[t, self.ego] @ self.white) / 3
-        error = b.x[b.at(("b", self.ego))]
-        apart = [float(np.square(error - b.x[b.at(("b", j))]).sum()) for j in held]
+        if self.ego in s.trusted:
+            return bool(s.hits["fix"] > 0 and s.locked.get(self.ego, 0.0) >= PATIENCE)
+        b, noise = s.belief, (self.r[t, self.ego] @ self.white) / 3
+        error = b.x[b.at("b", self.ego)]
+        apart = [float(np.square(error - b.x[b.at("b", j)]).sum()) for j in held]
         agree = error @ error > FIX_GATE * noise and apart[:1] < [FIX_GATE * noise]
         return len(held) >= 2 or bool(len(held) == 1 and (error @ error > WILD * noise or agree))
 
     def contradicted(self, t: int, j: int) -> bool:
-        hits, since = self.state["hits"][("relative", j)], t - self.state["joined"][j]
+        hits, since = self.state.hits[("relative", j)], t - self.state.joined[j]
         most = max(hits)
         return bool(most >= min(CONTRADICTED, max(2, since - most)) or sum(n >= 3 for n in hits) >= 2)
 
     def fix_terms(self, j: int) -> dict[Name, float]:
         names = [("x", j), ("b", j), ("common",)]
-        return {name: 1.0 for name in names if name in self.state["belief"].names}
+        return {name: 1.0 for name in names if name in self.state.belief.names}
 
     def steady(self, t: int, j: int, u: Floats, q: Floats) -> tuple[Floats, Floats]:
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
-        g, dt, louder = self.priors, self.seen.dt, self.state["louder"]
-        last, since, variance, slips = self.state["pace"].get(j, (u, -math.inf, q, 0))
+        g, dt, louder = self.priors, self.dt, self.state.louder
+        last, since, variance, slips = self.state.pace.get(j, (u, -inf, q, 0))
         changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
         strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
         if g.forget:
-            seen = min(t - self.state["began"] + 1, CHANGES)
+            seen = min(t - self.state.began + 1, CHANGES)
             louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, WIDEST) / 3 - 1) / seen), 1.0)
         if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > WILD and slips < 5:
-            self.state["pace"][j] = last, since, variance, slips + 1
+            self.state.pace[j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2
-        self.state["pace"][j] = u, t, q, 0
+        self.state.pace[j] = u, t, q, 0
         return u, q
 
     def predict(self, moved: Floats, q: Floats) -> None:
-        b, life = self.state["belief"], self.life
+        b, life = self.state.belief, self.life
         self.drive(self.ego, moved)
         b.noise(("x", self.ego), q)
         for name in b.names:
             if name[0] == "b" and life.own:
-                if name[1] in self.state["trusted"]:
+                if name[1] in self.state.trusted:
                     b.transform(name, {name: life.keep})
                 b.noise(name, life.own * (1 - life.keep**2))
             if name[0] == "r" and name[1] != self.ego:
-                keep = math.exp(-self.seen.dt / PAIR_TIME)
+                keep = exp(-self.dt / PAIR_TIME)
                 b.transform(name, {name: keep})
                 b.noise(name, [(1 - keep**2) * life.ranged[1], 0, 0])
         if life.common:
@@ -780,85 +785,86 @@ class Oracle:
 
     def add_turn(self, j: int) -> None:
         if self.life.turn.any():
-            self.state["belief"].add(("o", j), 0.0, self.life.turn)
+            self.state.belief.add(("o", j), 0.0, self.life.turn)
 
     def turn(self, j: int) -> Floats:
         """Errors of an odometry, where they are linear."""
-        b: Belief = self.state.get("linear", self.state["belief"])
-        return b.x[b.at(("o", j))]
+        b: Belief = self.state.belief
+        return b.x[b.at("o", j)]
 
     def turned(self, j: int, moved: Floats) -> tuple[Floats, Floats]:
         """A motion by odometry, corrected, and its derivatives by the errors of it."""
-        b, by = self.state["belief"], np.zeros((3, 3))
+        b, by = self.state.belief, np.zeros((3, 3))
         if ("o", j) not in b.names or (j == self.ego and self.corrected_now):
             return moved, by
         turn, scale, _ = self.turn(j)
-        c, s = math.cos(turn), math.sin(turn)
+        c, s = cos(turn), sin(turn)
         way = (1 + scale) * np.array([[c, -s], [s, c]]) @ moved[:2]
         by[:2, 0], by[:2, 1] = [-way[1], way[0]], way / (1 + scale)
         return np.append(way, moved[2]), by
 
     def drive(self, j: int, moved: Floats, steps: int = 1) -> None:
-        b, (way, by) = self.state["belief"], self.turned(j, moved)
-        b.x[b.at(("x", j))] += way
-        if j == self.ego and self.state["left"]:
-            self.state["left"] = self.state["left"][0] + way, self.state["left"][1]
-            self.state["driven"] += math.hypot(way[0], way[1])
+        b, (way, by) = self.state.belief, self.turned(j, moved)
+        b.x[b.at("x", j)] += way
+        if j == self.ego and self.state.left:
+            self.state.left = self.state.left[0] + way, self.state.left[1]
+            self.state.driven += hypot(way[0], way[1])
         if ("o", j) not in b.names:
             return
-        x, o, f, holds = b.at(("x", j)), b.at(("o", j)), np.eye(len(b.x)), self.life.holds**steps
+        x, o, f, holds = b.at("x", j), b.at("o", j), np.eye(len(b.x)), self.life.holds**steps
         f[x, o], f[o, o] = by, holds * np.eye(3)
         b.p = f @ b.p @ f.T
         b.x[o] *= holds
         b.noise(("o", j), (1 - holds**2) * self.life.turn)
 
-    def near(self, relative: Floats) -> Floats:
+    def near(self, j: int) -> Floats:
         """Where the ego measures a vehicle."""
-        b, far = self.state["belief"], 1 + (0.0 if np.isnan(relative[0]) else relative[0])
+        b, relative = self.state.belief, self.relative[j]
+        far = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
         gap = to_vector(relative) if np.isfinite(relative).all() else np.array([far, far, 0.1 * far])
-        near: Floats = b.x[b.at(("x", self.ego))] + gap
+        near: Floats = b.x[b.at("x", self.ego)] + gap
         return near
 
-    def join(self, t: int, j: int, message: Sent | None, relative: Floats) -> None:
-        s = self.state
-        b = s["belief"]
-        taken = {s["slot"][i] for i in s["members"]} if s["members"] else set()
-        s["slot"][j] = next(k for k in range(1, 10**6) if k not in taken)
-        s["members"].append(j)
-        s["joined"][j], s["hits"][("relative", j)] = t, [0, 0, 0]
-        s["since"][j] = t if message is None else message.step
-        b.add(("x", j), self.near(relative), FLAT)
+    def join(self, t: int, j: int) -> None:
+        s, b, message = self.state, self.state.belief, self.messages[j]
+        taken = {s.slot[i] for i in s.members} if s.members else set()
+        s.slot[j] = next(k for k in range(1, 10**6) if k not in taken)
+        s.members.append(j)
+        s.joined[j], s.hits[("relative", j)] = t, [0, 0, 0]
+        s.since[j] = t if message is None else message.step
+        b.add(("x", j), self.near(j), FLAT)
         if message is not None:
-            b.x[b.at(("x", j))] -= (t - message.step) * self.seen.dt * message.velocity
-        s["vague"].add(j)
-        s["locked"].pop(j, None)
-        s["way"].pop(j, None)
+            b.x[b.at("x", j)] -= (t - message.step) * self.dt * message.velocity
+        s.vague.add(j)
+        s.locked.pop(j, None)
+        s.way.pop(j, None)
         self.add_turn(j)
         if self.life.ranged[1]:
             b.add(("r", j), 0, [self.life.ranged[1], 0, 0])
-        variance = self.life.own + (0.0 if j in s["trusted"] else TAU**2)
+        variance = self.life.own + (0.0 if j in s.trusted else TAU**2)
         if variance:
             b.add(("b", j), 0.0, variance)
 
-    def measure(self, t: int, at: dict[int, Floats], order: list[int], relative: Any, messages: Any) -> None:
+    def measure(self, t: int, at: dict[int, Floats], order: list[int]) -> None:
         """Linear at the prediction."""
-        b = self.state["belief"]
+        b = self.state.belief
         if order and ("compass",) in b.names:
-            i = b.at(("compass",)).start + 1
+            i = b.at("compass").start + 1
             b.x[i], b.p[i], b.p[:, i] = 0.0, 0.0, 0.0
             b.p[i, i] = self.life.heading
         for j in order:
-            self.relate(t, j, at, relative[j], messages[j])
+            self.relate(t, j, at)
 
-    def relate(self, t: int, j: int, at: dict[int, Floats], relative: Floats, message: Any) -> None:
+    def relate(self, t: int, j: int, at: dict[int, Floats]) -> None:
+        relative, message = self.relative[j], self.messages[j]
         s, g, there = self.state, self.priors, np.isfinite(relative)
-        b, vague, hits = s["belief"], j in s["vague"], s["hits"][("relative", j)]
+        b, vague, hits = s.belief, j in s.vague, s.hits[("relative", j)]
         if not there.all() and vague:
             return
         gap, unit = at[j] - at[self.ego], self.known.sensors is None
         expected = np.array(spherical(*gap))
         far = expected[0]
-        ground, least = math.hypot(gap[0], gap[1]), 0.0 if unit else self.known.sensors.min_range  # type: ignore[union-attr]
+        ground, least = hypot(gap[0], gap[1]), 0.0 if unit else self.known.sensors.min_range  # type: ignore[union-attr]
         reach = max(far, least)
         flat = max(ground, 1e-3 * reach)
         rows = np.array(
@@ -871,11 +877,11 @@ class Oracle:
         residual, size = relative - expected, np.array([1.0, flat, reach])
         residual[1:] = wrap(residual[1:])
         z, r = residual + rows @ gap, 1 / size**2 if unit else self.std**2
-        r, age = r * np.exp(s["level"][:3]), (t - s["since"][j]) * self.seen.dt
-        s["way"][j], by = self.goes_on(t, j, message)
-        z = z - rows @ s["way"][j]
+        r, age = r * np.exp(s.level[:3]), (t - s.since[j]) * self.dt
+        s.way[j], by = self.goes_on(t, j)
+        z = z - rows @ s.way[j]
         if age:
-            r = r + rows**2 @ ((age / self.seen.dt) ** 2 * message.process + (ACCELERATION * age**2 / 2) ** 2)
+            r = r + rows**2 @ ((age / self.dt) ** 2 * message.process + (ACCELERATION * age**2 / 2) ** 2)
         h = []
         for c in range(3):
             terms: dict[Name, Any] = {("x", j): rows[c], ("x", self.ego): -rows[c]}
@@ -895,23 +901,28 @@ class Oracle:
             r = r + np.array([0.5 * (v**2 + w**2), u * p[1], u * p[2]]) / (reach * size) ** 2
         total = spread + r
         for c in np.flatnonzero(there):
-            log = math.log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
+            logdet = log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
             q = b.update(h[c], z[c], r[c], 0.0 if vague or not g.fix_gate else GATE)
             if not vague:
-                self.count(min(q, GATE), log, 1)
+                self.count(min(q, GATE), logdet, 1)
                 hits[c] = hits[c] + 1 if g.fix_gate and q > GATE else 0
                 self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
-        s["vague"].discard(j)
+        s.vague.discard(j)
 
-    def receive(self, t: int, j: int, message: Sent | None, relative: Floats) -> Sent | None:
+    def take(self, t: int, j: int) -> None:
+        """Use the newest message, and go on from there."""
+        self.messages[j] = self.receive(t, j, self.messages[j])
+        self.state.way[j] = self.goes_on(t, j)[0]
+
+    def receive(self, t: int, j: int, message: Sent | None) -> Sent | None:
         """Move to where the newest message was sent, use the fixes since the last one; the message as it is used."""
-        s, dt, last = self.state, self.seen.dt, self.state["last"].get(j)
-        b, since = s["belief"], s["since"][j]
+        s, dt, last = self.state, self.dt, self.state.last.get(j)
+        b, since = s.belief, s.since[j]
         if message is None and since < t:
-            s["since"][j] = t
-            s["vague"].add(j)
+            s.since[j] = t
+            s.vague.add(j)
             b.noise(("x", j), FLAT)
-            b.x[b.at(("x", j))] = self.near(relative)
+            b.x[b.at("x", j)] = self.near(j)
         if message is None or (last and message.step <= last.step):
             return message
         gap, steps = message.step - since, message.step - last.step if last else 1
@@ -921,21 +932,21 @@ class Oracle:
         half, spent = (1 + 1 / steps) / 2, (steps if follows else gap**2) * q
         b.noise(("x", j), half * spent)
         rows = [self.said(message, last, j, q, moved, steps, follows, c) for c in range(3)]
-        if last and j not in s["vague"] and j in s["trusted"] and None not in rows:
+        if last and j not in s.vague and j in s.trusted and None not in rows:
             self.learn_fix(4, rows)
         self.use_fix(t, j, rows, last is not None)
         b.noise(("x", j), (1 - half) * spent)
-        s["last"][j], s["since"][j] = message, message.step
+        s.last[j], s.since[j] = message, message.step
         return message._replace(process=q)
 
     def said(self, new: Sent, last: Any, j: int, q: Any, moved: Any, steps: int, follows: bool, c: int) -> Any:
         """Terms, number and variance of the mean of the fixes since the last message, None for none."""
-        fade, weight, z = math.exp(-self.seen.dt / FADES), new.weight[c], new.mean[c]
+        fade, weight, z = exp(-self.dt / FADES), new.weight[c], new.mean[c]
         old = fade**steps * last.weight[c] if last else 0.0
         old = old if weight > old * (1 - 1e-9) else 0.0
         if weight - old <= 1e-9 * weight or not weight:
             return None
-        louder, long = math.exp(self.state["level"][4]), 1 / (1 - fade**2)
+        louder, long = exp(self.state.level[4]), 1 / (1 - fade**2)
         white = louder * self.white[c] / (weight - old)
         if old:
             before = last.mean[c] + moved[c]
@@ -947,39 +958,39 @@ class Oracle:
             white *= (2 - min(n * (1 - fade), 1)) / (1 + fade)
             way = long * max(0, 1 - 1 / n)
         terms: dict[Name, Any] = dict(self.fix_terms(j))
-        if ("o", j) in self.state["belief"].names:  # by a clock that is ahead
+        if ("o", j) in self.state.belief.names:  # by a clock that is ahead
             terms["o", j] = np.outer(-new.velocity, [0, 0, 1])
         return terms, z, white + way * q[c]
 
-    def goes_on(self, t: int, j: int, message: Sent | None) -> tuple[Floats, Floats]:
+    def goes_on(self, t: int, j: int) -> tuple[Floats, Floats]:
         """The way since the newest message, and its derivatives by the errors of odometry."""
-        *_, slips = self.state["pace"].get(j, [0])
-        age = (t - self.state["since"][j]) * self.seen.dt
-        u = np.zeros(3) if message is None else self.state["pace"][j][0] if slips else message.velocity
+        message, (*_, slips) = self.messages[j], self.state.pace.get(j, [0])
+        age = (t - self.state.since[j]) * self.dt
+        u = np.zeros(3) if message is None else self.state.pace[j][0] if slips else message.velocity
         return self.turned(j, age * u)
 
     def trust(self) -> None:
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
         s, own = self.state, self.life.own
-        b, wide = s["belief"], TAU**2 + own
+        b, wide = s.belief, TAU**2 + own
         narrow = 1 / (1 / own - 1 / wide) if own else 1e-6
         while True:
             odds = {}
-            for j in (self.ego, *s["members"]):
-                if j in s["trusted"] or (j not in s["last"] and j != self.ego):
+            for j in (self.ego, *s.members):
+                if j in s.trusted or (j not in s.last and j != self.ego):
                     continue
-                at = b.at(("b", j))
+                at = b.at("b", j)
                 x, p = b.x[at], b.p[at, at]
-                odds[j] = math.log((1 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * self.revoked.get(j, 0)
+                odds[j] = log((1 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * s.revoked.get(j, 0)
                 if own:
-                    odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * math.log(2 * math.pi * wide / own * narrow)
+                    odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * log(2 * pi * wide / own * narrow)
                 else:
                     odds[j] += normal(x, p) - normal(0 * x, TAU**2 * np.eye(3))
-            best = max(odds, key=lambda j: (odds[j], -s["slot"][j]), default=-1)
+            best = max(odds, key=lambda j: (odds[j], -s.slot[j]), default=-1)
             if best < 0 or odds[best] <= TRUST_LOG_ODDS:
                 return
-            s["trusted"].add(best)
-            s["mean"].pop(best, None)
+            s.trusted.add(best)
+            s.mean.pop(best, None)
             for c in range(3):
                 b.update(b.row({("b", best): 1.0}, c), 0.0, narrow)
             if not own:
@@ -988,4 +999,4 @@ class Oracle:
 
 def normal(x: Floats, cov: Floats) -> float:
     """Logarithm of the density of N(0, cov)."""
-    return float(-0.5 * (np.linalg.slogdet(2 * math.pi * cov)[1] + x @ np.linalg.solve(cov, x)))
+    return float(-0.5 * (np.linalg.slogdet(2 * pi * cov)[1] + x @ np.linalg.solve(cov, x)))
