@@ -43,8 +43,8 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
     measured in the plane. The centralised one is learned alone and together."""
     from coopoc.learned.pose_noise import PoseTask, averaged, fit_pose_noise  # torch, which a mistake need not wait for
 
-    vehicles, marks = drives.counts(data)
-    alone = drives.drive(data, until, near(0))
+    source = drives.source(data)
+    alone = source.drive(until, near(0))
     steps, settled = (int(s / alone.recording.dt) for s in (until, min(SETTLED, until / 10)))
     assert alone.truth is not None
     first, truth = alone.recording.between(0, steps), alone.truth.between(0, steps)
@@ -52,13 +52,13 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
     def fitted(egos: tuple[str, ...], *ends: int) -> Sensors:
         tasks = []
         for k in dict.fromkeys(ends):
-            drive = drives.drive(data, until, near(k))
-            for landmarks in dict.fromkeys(min(n, marks) for n in TRAINING):
+            drive = source.drive(until, near(k))
+            for landmarks in dict.fromkeys(min(n, source.landmarks) for n in TRAINING):
                 part = thinned(drive.recording, landmarks, settled).between(0, steps)
                 tasks.append(PoseTask(part, truth, egos, _filter(FLEET, k, drive), settled))
         return fit_pose_noise(tasks, first.sensors, evaluations)
 
-    own, whole = [fitted((name,), 0) for name in alone.ids], fitted(alone.ids, *_ends(vehicles))
+    own, whole = [fitted((name,), 0) for name in alone.ids], fitted(alone.ids, *_ends(source.vehicles))
     mean, logs = averaged(own)
     who = [first.ids.index(name) for name in alone.ids]
     counted = np.isfinite(first.gnss[:, :, who, :2]).sum() + np.isfinite(first.relative[..., :2]).sum()
@@ -84,9 +84,10 @@ def key(p: Params) -> dict[str, str]:
     """
     if p["method"] not in EVERY:
         raise InputError("method", p["method"], f"must be among {list(EVERY)}", "Name one of them.")
-    drives.check(p["data"], drives.calibrated(p))
+    source = drives.source(p["data"])
+    source.check(drives.calibrated(p))
     channel(p)
-    return {"code": revision(*CODE), **drives.digests(p["data"])}
+    return {"code": revision(*CODE), **source.digests}
 
 
 def applies(p: Params) -> bool:
@@ -94,11 +95,11 @@ def applies(p: Params) -> bool:
     k, n, method, data = p["max_neighbours"], p["landmarks"], p["method"], p["data"]
     if not Path(split(data)[0]).exists():
         return True  # the key names what is wrong
-    vehicles, marks = drives.counts(data)
-    fits = _distinct(k, NEIGHBOURS, vehicles - 1) and _distinct(n, LANDMARKS, marks)
+    source = drives.source(data)
+    fits = _distinct(k, NEIGHBOURS, source.vehicles - 1) and _distinct(n, LANDMARKS, source.landmarks)
     if method in TRAINED:
-        taught = drives.calibrated(p) > 0 and drives.has_true_poses(data)
-        return fits and taught and (k == 0 or (method == CENTRAL and k in _ends(vehicles)))
+        taught = drives.calibrated(p) > 0 and source.posed
+        return fits and taught and (k == 0 or (method == CENTRAL and k in _ends(source.vehicles)))
     return fits and not (k == 0 and method in DECENTRALISED)
 
 
@@ -110,7 +111,7 @@ def _ends(vehicles: int) -> tuple[int, int]:
 def cell(p: Params) -> list[Row]:
     """Rows of one number of neighbours and landmarks: a vehicle and a block of time each."""
     until = drives.calibrated(p)
-    drive = drives.drive(p["data"], until, channel(p))
+    drive = drives.source(p["data"]).drive(until, channel(p))
     dt, (filters, once) = drive.recording.dt, _filters(p, drive)
     start, block = int(until / dt), max(int(drives.block(p) / dt), 1)
     recording = thinned(drive.recording, p["landmarks"], start)
@@ -134,8 +135,7 @@ def cell(p: Params) -> list[Row]:
 
 def driven(p: Params) -> float:
     """s of the drive that the bytes are for: set, else the part that is scored."""
-    left = drives.length(p["data"]) - drives.calibrated(p)
-    return left if p["drive_s"] is None else float(p["drive_s"])
+    return drives.left(p) if p["drive_s"] is None else float(p["drive_s"])
 
 
 def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
@@ -185,17 +185,16 @@ UNFIT = 100.0
 
 def _caption(results: Results, text: str) -> str:
     p = results.settings
-    data = p["data"]
-    marks = drives.counts(data)[1]
+    source = drives.source(p["data"])
     parts = [
         text,
-        drives.described(data).format(Path(split(data)[0]).name, drives.calibrated(p)),
+        source.text().format(Path(split(p["data"])[0]).name, drives.calibrated(p)),
         "Poses are found with all landmarks; then they are thinned and the rest is scored."
-        if marks
+        if source.landmarks
         else "There are no landmarks.",
         f"Intervals are over vehicles, then blocks of {drives.block(p):.3g} s.",
     ]
-    if not drives.has_true_poses(data):
+    if not source.posed:
         parts.append("No row is trained: that takes a truth with headings.")
     return " ".join(parts)
 

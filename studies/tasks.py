@@ -178,7 +178,7 @@ def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
     if task.startswith("robots"):
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
-        drive = pose_drives.drive(str(path), until, v2x)
+        drive = pose_drives.source(str(path)).drive(until, v2x)
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
@@ -189,7 +189,7 @@ def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
         begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE)
         return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
-    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")))
+    drive = pose_drives.source(str(path)).drive(0.0, V2X(max_neighbours=3, radius=float("inf")))
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
     noise = replace(drive.recording.sensors, range_std=RANGE_STD)
