@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 
 SAME_INSTANT = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
@@ -145,14 +145,25 @@ def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floa
     >>> interpolate(np.array([0.0, 1, 9]), np.array([[0.0], [1], [9]]), np.array([0.5, 5]), max_gap=2).ravel()
     array([0.5, nan])
     """
-    right = np.clip(np.searchsorted(t, grid, side="left"), 1, len(t) - 1)
-    left = right - 1
-    near = np.where(np.abs(grid - t[left]) < np.abs(grid - t[right]), left, right)
-    on_stamp = np.abs(grid - t[near]) <= SAME_INSTANT
-    grid = np.where(on_stamp, t[near], grid)
+    stamp = t[np.clip(np.searchsorted(t, grid - SAME_INSTANT), 0, len(t) - 1)]
+    grid = np.where(np.abs(grid - stamp) <= SAME_INSTANT, stamp, grid)
     out = np.column_stack([np.interp(grid, t, v, left=np.nan, right=np.nan) for v in values.T])
-    out[(t[right] - t[left] > max_gap + SAME_INSTANT) & ~on_stamp] = np.nan
-    return out
+    return np.where(covered(t, grid, max_gap, 0.0)[:, None], out, np.nan)
+
+
+def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
+    """True between samples at most `gap` apart, and up to `edge` beyond a sample.
+
+    >>> covered(np.array([0.0, 1, 5]), np.array([0.5, 2, 4.8]), 2.0, 0.3).tolist()
+    [True, False, True]
+    """
+    right = np.clip(np.searchsorted(t, at), min(1, len(t) - 1), len(t) - 1)
+    left = np.maximum(right - 1, 0)
+    between = (
+        (at >= t[left] - SAME_INSTANT) & (at <= t[right] + SAME_INSTANT) & (t[right] - t[left] <= gap + SAME_INSTANT)
+    )
+    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME_INSTANT
+    return between | near
 
 
 def check_scale(paths: Sequence[tuple[Floats, Floats]], file: str) -> None:
@@ -258,7 +269,7 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     )
 
 
-def nearest(late: Floats, *keys: Ints) -> Ints:
+def nearest(late: Floats, *keys: Ints | Floats) -> Ints:
     """Indices of one measurement per combination of keys, the nearest in time, sorted by these.
 
     Args:
@@ -295,7 +306,7 @@ def planar_recording(
     note: str,
 ) -> Recording:
     """One run, nothing simulated, over an ideal channel; landmarks stand, have their place as a fix at every step, and
-    send nothing.
+    send nothing. Of several measurements of a pair in a step the one nearest to its instant is kept.
 
     Args:
         ids: of n robots, then of the landmarks.
@@ -303,11 +314,14 @@ def planar_recording(
         velocity: (T, n, 2) m/s in the robots' frames, forward and left.
         yaw_rate: (T, n) rad/s.
         position: (m, 2) m, of the landmarks.
-        table: (L, 5) step, observer, neighbour, range m, bearing rad; NaN for what was not measured.
+        table: (L, 5) time s, observer, neighbour, range m, bearing rad; NaN for what was not measured, a negative
+            observer or neighbour for what is left out.
         sensors: the noise of all this.
         note: of the recording; that inclinations were not measured is added.
     """
     n = len(ids) - len(position)
+    step, late = steps_of(table[:, 0], t[1] - t[0], len(t))
+    table = np.column_stack([step, table[:, 1:]])[nearest(late, step, *table[:, 1:3].T)]
     table = table[np.lexsort(table[:, [3, 1, 0]].T)]
     links = Links(*table[:, :3].astype(np.int64).T)
     shape = (1, len(t), len(ids), 3)

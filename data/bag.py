@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,41 +13,43 @@ from coopoc.arrays import one_of
 from coopoc.errors import InputError, MissingLibraryError, said, unknown
 
 from .cells import numeric
-from .log.units import Rows, Summary, rows_of
+from .log.units import Rows, Summary, of_kinds
 
+TURN = "orientation.x orientation.y orientation.z orientation.w"
+POSE = "pose.position.x pose.position.y pose.position.z pose.orientation.x pose.orientation.y pose.orientation.z \
+pose.orientation.w"
 READ = {
-    "sensor_msgs/msg/NavSatFix": "fix",
-    "nav_msgs/msg/Odometry": "odometry",
-    "sensor_msgs/msg/Imu": "imu",
-    "geometry_msgs/msg/PoseStamped": "pose",
-    "sensor_msgs/msg/Range": "range",
+    "sensor_msgs/msg/NavSatFix": "fix latitude longitude altitude status.status position_covariance_type \
+position_covariance",
+    "nav_msgs/msg/Odometry": "odometry twist.twist.linear.x twist.twist.angular.z twist.covariance",
+    "sensor_msgs/msg/Imu": f"imu angular_velocity.z angular_velocity_covariance {TURN} orientation_covariance",
+    "geometry_msgs/msg/PoseStamped": f"pose {POSE}",
+    "sensor_msgs/msg/Range": "range range min_range max_range",
 }
-INVALID = {
-    "fix": "fixes that the receiver calls invalid",
-    "range": "ranges outside of what the sensor says it can measure",
-}
+"""Type of a message -> what it is, and its fields that are read."""
 TRUTH = ("truth", "ground_truth", "groundtruth")
-WHEELS = "yaw_rate of odometry"
 STAMP = "header.stamp.sec"
 """Column of a topic that was written as a table."""
 FIELDS = {
     "latitude": "latitude",
     "longitude": "longitude",
     "altitude": "height",
+    "position_covariance_0": "longitude_std",
+    "position_covariance_4": "latitude_std",
+    "position_covariance_8": "height_std",
     "twist.twist.linear.x": "speed",
+    "twist.covariance_0": "speed_std",
     "twist.twist.angular.z": "yaw_rate",
+    "twist.covariance_35": "yaw_rate_std",
     "angular_velocity.z": "yaw_rate",
+    "angular_velocity_covariance_8": "yaw_rate_std",
+    "orientation_covariance_8": "heading_std",
+    "range": "range",
     **{f"pose.position.{axis}": axis for axis in "xyz"},
 }
-"""Column of a topic -> kind; deviations of others than fixes are given with std=."""
-VARIANCES = {
-    f"position_covariance{form.format(k)}": f"{kind}_std"
-    for form in ("[{}]", "_{}")
-    for k, kind in ((0, "longitude"), (4, "latitude"), (8, "height"))
-}
-"""Column of a topic, as several programs call it -> deviation; zeros mean unknown."""
-Number = tuple[str, float, float]
-"""Kind, value and standard deviation."""
+"""Field, with the index in it -> kind, or the deviation whose variance it is; zeros mean unknown."""
+UNMEASURED = {"angular_velocity_covariance_0": "yaw_rate", "orientation_covariance_0": "heading"}
+"""Field that is negative where a kind is not measured."""
 
 
 def read_bag(
@@ -96,7 +99,7 @@ def read_bag(
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
     one_of("stamps", stamps, ("header", "received"))
-    rows, behind = list[tuple[Any, ...]](), list[float]()
+    messages, behind = dict[str, list[tuple[Any, ...]]](), list[float]()
     folder = path.parent if path.suffix == ".db3" else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -105,23 +108,22 @@ def read_bag(
                 if topic not in topics:
                     raise unknown(f"{path.name}: topic", topic, sorted(topics))
             wanted = [c for c in reader.connections if topics[c.topic]]
-            of = _vehicles({c.topic: READ[c.msgtype] for c in wanted}, truth, path.stem)
+            what, fields = dict[str, str](), dict[str, list[str]]()
+            for c in wanted:
+                what[c.topic], *fields[c.topic] = READ[c.msgtype].split()
+            of = _vehicles(what, truth, path.stem)
             for c in reader.connections:
                 if not topics[c.topic]:
                     summary.leave(f"{path.name}: topic {c.topic} ({c.msgtype})", c.msgcount)
-            for c, received, raw in reader.messages(connections=wanted) if wanted else ():
-                (name, partner), true = of[c.topic]
+                elif what[c.topic] == "odometry" and of[c.topic][1]:
+                    fields[c.topic] = [f"pose.{field}" for field in POSE.split()]
+            for number, (c, received, raw) in enumerate(reader.messages(connections=wanted) if wanted else (), 1):
                 message: Any = reader.deserialize(raw, c.msgtype)
-                what, stamp, arrived = READ[c.msgtype], message.header.stamp, received * 1e-9
-                numbers = _numbers(what, message, true)
-                if not numbers and what in INVALID:
-                    summary.refuse(INVALID[what], 1, f"{path.name}: {c.topic}")
+                stamp, arrived = message.header.stamp, received * 1e-9
                 sent = stamp.sec + stamp.nanosec * 1e-9
                 behind.append(arrived - sent)
-                t = sent if stamps == "header" else arrived
-                for kind, value, std in numbers:
-                    if kind.partition(" of ")[0] not in ignore:
-                        rows.append((true, t, name, partner, kind, value, std))
+                values = attrgetter(*fields[c.topic])(message)
+                messages.setdefault(c.topic, []).append((number, sent if stamps == "header" else arrived, *values))
     except InputError:
         raise
     except Exception as error:  # of rosbags: a damaged file meets them all
@@ -130,15 +132,24 @@ def read_bag(
         other = "received" if stamps == "header" else "header"
         spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"
         summary.assume(f"times are those of stamps={stamps}; headers are {spread} (stamps={other}: by the other)")
-    frame = pd.DataFrame(rows, columns=["true", "t", "vehicle", "partner", "kind", "value", "std"])
-    gyros = frame["vehicle"][frame["kind"] == "yaw_rate"]
-    frame = frame[(frame["kind"] != WHEELS) | ~frame["vehicle"].isin(gyros)].replace({WHEELS: "yaw_rate"})
-    frame = _by_number(frame, summary)
-    if frame["true"].all():
-        kinds_read = ", ".join(kind.rpartition("/")[2] for kind in READ)
-        raise InputError(path.name, "0 messages", f"must hold {kinds_read}", "Check the topics with: ros2 bag info.")
-    frame.index = frame.groupby("true").cumcount() + 1
-    return rows_of(frame, path.name)
+    parts = dict[str, Rows]()
+    for topic, table in messages.items():
+        frame = pd.DataFrame(table, columns=["number", "t", *fields[topic]]).set_index("number")
+        for field in frame.columns[frame.columns.str.endswith("covariance")]:
+            matrix = pd.DataFrame(np.stack(frame[field].tolist()), frame.index)
+            frame = frame.join(matrix.add_prefix(f"{field}_"))
+        (vehicle, partner), true = of[topic]
+        kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
+        rows = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), path.name)
+        parts[topic] = rows[~rows["kind"].isin(ignore)]
+    if all(rows["true"].all() for rows in parts.values()):
+        types = ", ".join(name.rpartition("/")[2] for name in READ)
+        raise InputError(path.name, "0 messages", f"must hold {types}", "Check the topics with: ros2 bag info.")
+    rows = pd.concat(parts).sort_values("row", kind="stable")
+    by, turns = rows.index.get_level_values(0).map(what), rows["kind"] == "yaw_rate"
+    gyros = rows["vehicle"][turns & (by == "imu")]
+    rows = rows[~(turns & (by == "odometry") & rows["vehicle"].isin(gyros))]
+    return _by_number(rows.reset_index(drop=True), summary)
 
 
 def _vehicles(kinds: Mapping[str, str], truth: str, bag: str) -> dict[str, tuple[tuple[str, str], bool]]:
@@ -176,66 +187,43 @@ def _by_number(frame: pd.DataFrame, summary: Summary) -> pd.DataFrame:
     return frame.replace({"vehicle": same, "partner": same})
 
 
-def _numbers(kind: str, m: Any, true: bool) -> list[Number]:
-    """What a message holds; its pose where it is the truth's."""
-    if kind == "pose" or (kind == "odometry" and true):
-        pose = getattr(m.pose, "pose", m.pose)
-        numbers = [(axis, float(getattr(pose.position, axis)), np.nan) for axis in "xyz"]
-        return numbers + _heading(pose.orientation, np.nan) * true
-    if kind == "fix":
-        if m.status.status < 0 or not np.isfinite([m.latitude, m.longitude]).all():
-            return []
-        east, north, up = _deviations(m.position_covariance, 3) if m.position_covariance_type else np.full(3, np.nan)
-        values = (("latitude", m.latitude, north), ("longitude", m.longitude, east), ("height", m.altitude, up))
-        return [(what, float(value), float(std)) for what, value, std in values if np.isfinite(value)]
-    if kind == "odometry":
-        std, twist = _deviations(m.twist.covariance, 6), m.twist.twist
-        return [("speed", float(twist.linear.x), std[0]), (WHEELS, float(twist.angular.z), std[5])]
-    if kind == "range":
-        most = m.max_range if m.max_range > 0 else np.finfo(float).max  # 0: not stated
-        valid = max(m.min_range, 0.0) <= m.range <= most
-        return [("range", float(m.range), np.nan)] if valid else []
-    numbers = []
-    if m.angular_velocity_covariance[0] >= 0:
-        numbers.append(("yaw_rate", float(m.angular_velocity.z), _deviations(m.angular_velocity_covariance, 3)[2]))
-    if m.orientation_covariance[0] >= 0:
-        numbers += _heading(m.orientation, _deviations(m.orientation_covariance, 3)[2])
-    return numbers
-
-
 def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd.DataFrame:
     """A topic that was written as a table, a column per field of the message, as a wide table of a log."""
+    frame = frame.rename(columns=lambda name: re.sub(r"\[(\d+)\]$", r"_\1", name))  # as several programs call it
     nano = next((name for name in ("header.stamp.nanosec", "header.stamp.nsec") if name in frame), None)
     t = numeric(frame, STAMP, file) + (1e-9 * numeric(frame, nano, file) if nano else 0.0)
-    if "status.status" in frame:
-        invalid = numeric(frame, "status.status", file) < 0
-        summary.refuse(INVALID["fix"], int(invalid.sum()), file)
-        frame, t = frame[~invalid], t[~invalid]
-    made = {"t": t}
+    known = {*FIELDS, *UNMEASURED, *" ".join([*READ.values(), POSE.replace("pose.", "pose.pose.")]).split()}
+    topic = {name: numeric(frame, name, file) for name in frame if name in known}
+    return kinds_of(pd.DataFrame({"t": t, **topic}, frame.index), true, summary, file)
+
+
+def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> pd.DataFrame:
+    """The times t, kinds and deviations, in columns, of a topic with a column per field; NaN where there is none."""
     if true:
-        frame = frame.rename(columns=lambda name: name.replace("pose.pose.", "pose."))
-    made |= {kind: numeric(frame, name, file) for name, kind in FIELDS.items() if name in frame}
-    for name in filter(frame.__contains__, VARIANCES):
-        variance = numeric(frame, name, file)
-        made[VARIANCES[name]] = np.sqrt(np.where(variance > 0, variance, np.nan))
-    turn = "pose.orientation" if true else "orientation"
-    if {f"{turn}.{axis}" for axis in "xyzw"} <= {*frame}:
-        made["heading"] = _yaw(*(numeric(frame, f"{turn}.{axis}", file) for axis in "xyzw"))
-    return pd.DataFrame(made, index=frame.index)
-
-
-def _deviations(covariance: Any, size: int) -> Any:
-    """Square roots of the diagonal, NaN where it is not positive: zeros mean unknown."""
-    diagonal = np.asarray(covariance, dtype=float).reshape(size, size).diagonal()
-    return np.sqrt(np.where(diagonal > 0, diagonal, np.nan))
-
-
-def _heading(q: Any, std: float) -> list[Number]:
-    yaw = float(_yaw(q.x, q.y, q.z, q.w))
-    return [("heading", yaw, std)] if np.isfinite(yaw) else []
+        topic = topic.rename(columns=lambda name: name.replace("pose.pose.", "pose."))
+    reason, finite = "poses that are not finite", topic.filter(regex="^(l.*itude|pose.position.*)$")
+    valid = pd.Series(np.isfinite(finite).all(axis=1), topic.index)
+    if "status.status" in topic:
+        reason, valid = "fixes that the receiver calls invalid", valid & (topic["status.status"] >= 0)
+    elif "min_range" in topic:
+        most = topic["max_range"].where(topic["max_range"] > 0, np.finfo(float).max)  # 0: not stated
+        valid = topic["range"].between(topic["min_range"].clip(0), most)
+        reason = "ranges outside of what the sensor says it can measure"
+    summary.refuse(reason, int((~valid).sum()), where)
+    topic = topic[valid]
+    made = {"t": topic["t"]} | {kind: topic[name] for name, kind in FIELDS.items() if name in topic}
+    turn = (POSE if true else TURN).split()[-4:]
+    if {*turn} <= {*topic}:
+        made["heading"] = _yaw(*(topic[axis] for axis in turn))
+    for name, kind in UNMEASURED.items():
+        if name in topic and kind in made:
+            made[kind] = made[kind].where(topic[name] >= 0)
+    known = topic.get("position_covariance_type", 1) != 0  # 0: the covariance is unknown
+    deviations = {name: np.sqrt(each.where(known & (each > 0))) for name, each in made.items() if name.endswith("_std")}
+    return pd.DataFrame(made | deviations)
 
 
 def _yaw(x: Any, y: Any, z: Any, w: Any) -> Any:
     """Rotation about z, rad; NaN for a quaternion that is none."""
     whole = np.abs(x * x + y * y + z * z + w * w - 1) < 0.02
-    return np.where(whole, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), np.nan)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)).where(whole)

@@ -52,17 +52,10 @@ def read_table(
 def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
     """Write id, t, x, y, z and, if asked for, vx, vy, vz of every present vehicle and instant, vehicle by vehicle, to a
     .parquet or (any other ending) CSV file; numbers come back bit by bit."""
-    import pandas as pd
-
-    column, step = np.nonzero(fleet.present.T)
-    text = path.suffix != ".parquet"
-    ids = np.array([spreadsheet(name) if text else name for name in fleet.ids])
-    frame = pd.DataFrame({"id": ids[column], "t": np.round(fleet.t[step], 6)})
-    frame[["x", "y", "z"]] = fleet.position[step, column]
-    if velocity:
-        frame[list(VELOCITY)] = fleet.velocity[step, column]
-    if text:
-        frame.to_csv(path, index=False, lineterminator="\n")
+    frame = fleet.to_frame().rename(columns={"vehicle": "id"}).round({"t": 6})[[*NEEDED, *velocity * VELOCITY]]
+    frame = frame.sort_values("id", key=lambda ids: ids.map(fleet.ids.index), kind="stable")
+    if path.suffix != ".parquet":
+        frame.assign(id=frame["id"].map(spreadsheet)).to_csv(path, index=False, lineterminator="\n")
     else:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
         frame.to_parquet(path, index=False, compression="zstd", use_dictionary=["id", "t"], column_encoding=split)

@@ -11,7 +11,7 @@ from coopoc.formats.graph import Graph, PointEdges
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.body_frames import midway, turned
 
-from .assemble import backward_difference, nearest, planar_recording, steps_of
+from .assemble import backward_difference, planar_recording
 from .log.read import Log, steps_in_words
 from .log.units import Summary
 
@@ -79,7 +79,7 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
         velocity,
         moved[..., 2],
         graph.position[marks],
-        _relative(graph, column, n, begin, t),
+        _relative(graph, column, n, begin),
         _sensors(graph, dt),
         "odometry and relative measurements are real; no fix, no compass",
     )
@@ -123,17 +123,15 @@ def _vectors(graph: Graph) -> PointEdges:
     )
 
 
-def _relative(graph: Graph, column: Ints, robots: int, begin: float, t: Floats) -> Floats:
-    """(L, 5) step, observer, neighbour, range m, bearing rad or NaN; of several of a pair at a step the nearest in
-    time."""
+def _relative(graph: Graph, column: Ints, robots: int, begin: float) -> Floats:
+    """(L, 5) s, observer (-1 between points), neighbour, range m, bearing rad or NaN."""
     points, ranges = _vectors(graph), graph.ranges
     ends = column[np.concatenate([points.nodes, ranges.nodes])]
     ends = np.where((ends[:, :1] >= robots) & (ends[:, :1] > ends[:, 1:]), ends[:, ::-1], ends)  # a robot observes
     reach = np.append(np.hypot(*points.position.T), ranges.distance)
     bearing = np.append(np.arctan2(*points.position.T[::-1]), np.full(len(ranges), np.nan))
-    step, late = steps_of(np.append(points.stamps, ranges.stamps) - begin, t[1] - t[0], len(t))
-    order = nearest(late, step, np.where(ends[:, 0] < robots, ends[:, 0], -1), ends[:, 1])
-    return np.column_stack([step, ends, reach, bearing])[order]
+    observer = np.where(ends[:, 0] < robots, ends[:, 0], -1)
+    return np.column_stack([np.append(points.stamps, ranges.stamps) - begin, observer, ends[:, 1], reach, bearing])
 
 
 def _sensors(graph: Graph, dt: float) -> Sensors:

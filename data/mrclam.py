@@ -15,16 +15,7 @@ from coopoc.text import given_path, short_repr
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
 
-from .assemble import (
-    PLANE_STD,
-    backward_difference,
-    check_size,
-    check_time,
-    interpolate,
-    nearest,
-    planar_recording,
-    steps_of,
-)
+from .assemble import PLANE_STD, backward_difference, check_size, check_time, interpolate, planar_recording
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
@@ -172,8 +163,8 @@ class Calibration(NamedTuple):
 def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
     """Recording of the robots' own measurements, one run: odometry, range and bearing of robots and landmarks.
 
-    There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of
-    a subject in a step the one nearest to the step's instant is kept; `data.log.links.under` chooses a channel.
+    There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. `data.log.links.under`
+    chooses a channel.
 
     Args:
         log: of read_mrclam.
@@ -185,25 +176,18 @@ def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
     robots, marks = log.fleet.ids, surveyed(log)
     wheel, turning = (_delayed(log, values, calibration.lag) for values in (log.speed, log.turn_rate))
     forward = _driven(calibration.speed, calibration.slip, wheel, turning)
-    sightings = _on_steps(log, log.sightings)
-    sightings[:, 2] += len(robots)
+    sightings = log.sightings.copy()
+    sightings[sightings[:, 2] >= 0, 2] += len(robots)
     return planar_recording(
         (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
         log.fleet.t,
         forward[..., None] * [1.0, 0.0],
         calibration.turn * turning,
         marks[:, 1:],
-        np.vstack([_on_steps(log, log.others), sightings]),
+        np.vstack([log.others, sightings]),
         calibration.sensors,
         "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
     )
-
-
-def _on_steps(log: MrclamLog, measurements: Floats) -> Floats:
-    """(L, 5) step, observer, subject, range, bearing: the measurement nearest to a step of those of a subject in it."""
-    t, observer, subject, *_ = measurements.T
-    step, late = steps_of(t, log.fleet.dt, len(log.fleet.t))
-    return np.column_stack([step, measurements[:, 1:]])[nearest(late, step, observer, subject)]
 
 
 def surveyed(log: MrclamLog) -> Floats:

@@ -40,7 +40,6 @@ from .motion import CLOCKWISE, HOLDS
 from .read import Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, long_off, measurements, of_measurements, of_ranges, when
 from .residuals import Check, filtered
-from .unseen import unseen
 
 MISTAKEN = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
@@ -59,6 +58,8 @@ CONFIDENT_RATIO = 3.0
 """Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
 UNUSED_SHARE = 0.05
 """Share of what was logged that may be left out without a word."""
+PERHAPS = 2.0
+"""Standard errors from which an error may be one."""
 DIVERGED = 0.3
 """Share of its speeds that no odometry errs by, so that a filter that estimates it has diverged."""
 USED = "fixes", "relative measurements", "edges", "messages"
@@ -105,7 +106,7 @@ def check(log: Log) -> Check:
         sentences += rule(result)
         bar.update()
     bar.close()
-    return replace(result, warnings=tuple(sentences), unseen=tuple(unseen(result)))
+    return replace(result, warnings=tuple(sentences), unseen=tuple(_unseen(result)))
 
 
 def _without(c: Check, columns: Sequence[int]) -> Check:
@@ -417,6 +418,47 @@ def _of_fixes(c: Check) -> list[str]:
                 f"{name}: fixes lie {east[0]:.3g} m east and {north[0]:.3g} m north of the truth in the median. {hint}"
             )
     return sentences
+
+
+def _unseen(c: Check) -> list[str]:
+    """What the check could not see, and of whom."""
+    sentences, every = [], [row["vehicle"] for row in c.vehicles]
+    if c.log.truth is None:
+        sentences.append("errors that all sensors share, and a clock that is wrong for all alike: there is no truth")
+    if not every:
+        sentences.append("errors of fixes, none of which changes while nothing moves")
+    turns = ("turned", LEAST_TURN, "rad, of the direction of the odometry")
+    if c.log.recording.body is not None:
+        turns = ("yaw_rate_bias", LEAST_DRIFT, "rad/s, of the yaw rates")
+    for name, least, what in (("speed_excess", LEAST_SCALE, "as a share, of the speeds"), turns):
+        errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", np.inf) for row in c.vehicles}
+        if blind := _below(errors, 2 * least):
+            sentences.append(f"errors, {what} of {blind}")
+        for row in c.vehicles:
+            value, error = row.get(name, 0.0), row.get(f"{name}_error", np.inf)
+            if max(least, PERHAPS * error) < abs(value) <= SURE_ERRORS * error:
+                sentences.append(
+                    f"whether an error of {value:.2g} +- {error:.2g} ({what} of {row['vehicle']}) is more than chance"
+                )
+    late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
+    if blind := _below(
+        {who: SURE_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
+    ):
+        sentences.append(f"errors, s, of the clocks of {blind}")
+    fixes = np.isfinite(c.fix[..., 0]).sum(axis=0)
+    if few := [who for who in every if fixes[c.world.ids.index(who)] < LEAST_COUNT]:
+        sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
+    sensors = c.world.sensors
+    stated = {"fixes": sensors.gnss_std[0]} | {f"{row['measurement']}s": row["stated_std"] for row in c.measurements}
+    if near := [f"{name} ({std:.2g})" for name, std in stated.items() if 0.7 < std < 1.4]:
+        sentences.append(f"whether deviations of {', '.join(near)} are variances: both are near 1")
+    return sentences
+
+
+def _below(errors: Mapping[str, float], enough: float) -> str:
+    """Names of what is not known as well as enough, with what stays hidden."""
+    blind = {name: error for name, error in errors.items() if error > enough}
+    return ", ".join(f"{name} (below {error:.2g})" if np.isfinite(error) else name for name, error in blind.items())
 
 
 CHECKS: tuple[Callable[[Check], list[str]], ...] = (

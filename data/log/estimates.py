@@ -1,6 +1,6 @@
 """Errors of a log's clocks, odometry, antennas and pairs, with standard errors by parts of the drive."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -327,31 +327,24 @@ def median(values: Floats) -> tuple[float, float]:
     return float(np.median(values)), float(np.std(parts) / np.sqrt(BLOCKS - 1.0))
 
 
-def by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats, Floats]]:
-    """Names of a pair, its residuals of one kind in order of time, what they should scatter by, and what a standard
-    error of each clock that was taken off makes of them (M, N)."""
-    links, ids = c.world.links, c.world.ids
-    there = np.isfinite(c.relative[:, k])
+def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
+    """Who measured whom, or between which two if not `directed`: of the links that have a residual of one kind."""
+    links, ids = c.world.links, np.array(c.world.ids, dtype=object)
+    there = np.flatnonzero(np.isfinite(c.relative[:, k]))
     ends = np.column_stack([links.observer, links.neighbour])[there]
-    pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
-    for number, (observer, neighbour) in enumerate(pairs.tolist()):
-        rows_of_pair = np.flatnonzero(there)[index.reshape(-1) == number]
-        yield (
-            f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}",
-            c.relative[rows_of_pair, k],
-            c.expected[rows_of_pair, k],
-            c.slack[rows_of_pair, min(k, 1)],
-        )
+    one, other = ids[ends if directed else np.sort(ends)].T
+    return pd.Series(one + (" to " if directed else " and ") + other, there)
 
 
 def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
     """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
     errors of the filters and of the clocks that were taken off, which last."""
-    made, lasts = {}, share(c)
-    for pair, value, expected, slack in by_pair(c, k):
-        (offset, error), position = median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
-        lasting = stated**2 / len(value) + position * lasts + np.square(slack.mean(axis=0)).sum()
-        made[pair] = offset, float(np.sqrt(error**2 + lasting))
+    made, lasts, names = {}, share(c), pairs(c, k, k > 0)
+    for pair, rows in names.groupby(names).groups.items():
+        (offset, error), slack = median(c.relative[rows, k]), c.slack[rows, min(k, 1)].mean(axis=0)
+        position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
+        lasting = stated**2 / len(rows) + position * lasts + np.square(slack).sum()
+        made[str(pair)] = offset, float(np.sqrt(error**2 + lasting))
     return made
 
 

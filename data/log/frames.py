@@ -126,29 +126,27 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
         latitude, longitude, height = fixes.iloc[0].tolist()
         origin = latitude, longitude, height
     metres = np.column_stack(pymap3d.geodetic2enu(*fixes.to_numpy().T, *origin))
-    enu = pd.DataFrame(metres, fixes.index, columns=pd.Index(ENU, name="kind")).reset_index().melt(keys[:2])
-    value = rows.merge(enu, how="left", on=keys, suffixes=("", "_enu"))["value_enu"].set_axis(rows.index)
-    value = value.where(geodetic, rows["value"])
+    enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
+    value = rows["value"].mask(geodetic, enu.reindex(pd.MultiIndex.from_frame(rows[keys])).to_numpy())
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
 
 
 def _nowhere(rows: Rows) -> Bools:
     """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where others of the vehicle are
     too far away for its speed."""
-    key, some = ["t", "vehicle"], only(rows, "latitude", "longitude", "x", "y")
-    zero = some[some["value"] == 0.0].drop_duplicates([*key, "kind"])
-    zero = zero[zero.duplicated(key, keep=False)]
-    fixes = some.drop_duplicates([*key, "kind"]).pivot(index=key[::-1], columns="kind", values="value")
-    fixes, at_zero = fixes.reset_index("t"), fixes.index.isin(zero.set_index(key[::-1]).index)
-    moves = fixes.groupby("vehicle").diff()
-    pace = pd.Series(np.hypot(*moves.reindex(columns=["x", "y"]).to_numpy().T) / moves["t"].to_numpy(), fixes.index)
-    leap = at_zero != pd.Series(at_zero, fixes.index).groupby("vehicle").shift(fill_value=False).to_numpy()
-    usual = pace[~at_zero & ~leap].groupby("vehicle").agg(["size", lambda each: each.quantile(0.8)])
-    least = pace[leap].groupby("vehicle").min().reindex(usual.index)
-    away = usual.index[(least > LEAPS * usual.iloc[:, 1]) & (usual["size"] >= LOCATING_FIXES)]
-    zero = zero[zero["kind"].isin(ENU) | zero["vehicle"].isin(away)]
-    at = rows.set_index(key).index.isin(zero.set_index(key).index)
-    return np.asarray(at & in_group(rows, "fix"))
+    key, axes = ["vehicle", "t"], ["x", "y", "latitude", "longitude"]
+    fixes = only(rows, *axes).drop_duplicates([*key, "kind"]).pivot(index=key, columns="kind", values="value")
+    fixes = fixes.reindex(columns=axes).reset_index()
+    at_zero, no_degrees = (fixes[names].eq(0.0).all(axis=1) for names in (axes[:2], axes[2:]))
+    moves, vehicle = fixes.groupby("vehicle").diff(), fixes["vehicle"]
+    pace = np.hypot(moves["x"], moves["y"]) / moves["t"]
+    leap = at_zero != at_zero.groupby(vehicle).shift(fill_value=False)
+    usual = ~at_zero & ~leap
+    most = LEAPS * pace.where(usual).groupby(vehicle).transform("quantile", 0.8)
+    away = pace.where(leap).groupby(vehicle).transform("min") > most
+    away &= usual.groupby(vehicle).transform("sum") >= LOCATING_FIXES
+    none = fixes.set_index(key).index[no_degrees | (at_zero & away)]
+    return np.asarray(rows.set_index(key).index.isin(none) & in_group(rows, "fix"))
 
 
 def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: "Sequence[Member]") -> Sensors:

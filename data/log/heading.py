@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from coopoc.arrays import AnyArray, Bools, Floats
+from coopoc.arrays import AnyArray, Floats
 from coopoc.world.links import wrap
 
-from ..assemble import SAME_INSTANT
+from ..assemble import SAME_INSTANT, covered
 
 BASELINE = 10.0
 """Standard deviations of a fix, by which two must be apart to show a direction: to 0.14 rad."""
@@ -230,21 +230,6 @@ def held(signal: Signal, at: Floats) -> Floats:
     """
     last = np.searchsorted(signal.t, at + SAME_INSTANT, side="right") - 1
     return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], np.nan)
-
-
-def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
-    """True between samples at most `gap` apart, and up to `edge` beyond a sample.
-
-    >>> covered(np.array([0.0, 1, 5]), np.array([0.5, 2, 4.8]), 2.0, 0.3).tolist()
-    [True, False, True]
-    """
-    right = np.clip(np.searchsorted(t, at), min(1, len(t) - 1), len(t) - 1)
-    left = np.maximum(right - 1, 0)
-    between = (
-        (at >= t[left] - SAME_INSTANT) & (at <= t[right] + SAME_INSTANT) & (t[right] - t[left] <= gap + SAME_INSTANT)
-    )
-    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME_INSTANT
-    return between | near
 
 
 def integral(signal: Signal, at: Floats) -> Floats:

@@ -13,12 +13,11 @@ from coopoc.kernels.constant_velocity import BANK, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
-from ..assemble import SAME_INSTANT, longest_gap, nearest, steps_of
+from ..assemble import SAME_INSTANT, covered, longest_gap, nearest, steps_of
 from .heading import (
     Course,
     Reckoning,
     Signal,
-    covered,
     heading_at,
     heading_of_courses,
     heading_of_rates,

@@ -18,7 +18,7 @@ from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED
 
-from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
+from ..assemble import backward_difference, check_scale, check_size, check_time, covered, interpolate, longest_gap
 from ..bag import STAMP, read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
@@ -27,7 +27,6 @@ from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
-from .heading import covered
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
@@ -228,10 +227,8 @@ def read_log(
     ids = _ids(rows, body, summary)
     carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
-    count = (
-        rows.groupby("vehicle")["kind"].value_counts().unstack(fill_value=0).reindex(columns=["x", "z"], fill_value=0)
-    )
-    few = rows["vehicle"].isin(count.index[2 * count["z"] < count["x"]]) & (rows["kind"] == "z")
+    fixed, high = (rows["kind"].eq(kind).groupby(rows["vehicle"]).transform("sum") for kind in ("x", "z"))
+    few = (2 * high < fixed) & (rows["kind"] == "z")
     summary.refuse("heights of vehicles with few", rows[few])
     rows = rows[~few]
     grid = _grid(rows, dt, body, summary)

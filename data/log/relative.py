@@ -8,7 +8,7 @@ import pandas as pd
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
-from .estimates import LEAST_COUNT, MOVED_STDS, OUTLYING, SURE_ERRORS, by_pair, offsets
+from .estimates import LEAST_COUNT, MOVED_STDS, OUTLYING, SURE_ERRORS, offsets, pairs
 from .frames import UNSTATED
 from .motion import MOVING
 from .residuals import Check, plane
@@ -39,26 +39,24 @@ def measurements(c: Check) -> list[dict[str, Any]]:
     """Rows of a table: each kind of relative measurement, and how it scatters about the positions."""
     rows = []
     for k, (name, unit) in enumerate(UNITS.items()):
-        there, stated = np.isfinite(c.relative[:, k]), float(c.world.sensors.relative_std[k])
-        residual = c.relative[there, k]
-        if not there.any() or np.ptp(c.log.recording.relative[0, there, k]) == 0:
+        pair, stated = pairs(c, k, k > 0), float(c.world.sensors.relative_std[k])
+        residual, expected = (pd.Series(values[pair.index, k], pair.index) for values in (c.relative, c.expected))
+        if not len(pair) or np.ptp(c.log.recording.relative[0, pair.index, k]) == 0:
             continue
-        named = {pair: offset for pair, offset, _ in _named(c, k, stated)}
-        pairs, values, expected, _ = zip(*by_pair(c, k), strict=True)
-        less = [value - named.get(pair, 0.0) for pair, value in zip(pairs, values, strict=True)]
-        near = [value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for value in values]
-        off = np.concatenate(near)  # errors of the filters last longer than that window
-        noise, doubt = robust_std(off), np.concatenate(expected) / 2  # a direction of what is near hardly counts
-        least = np.maximum(max(noise, 0.2 * stated), doubt)
+        known = pair.map({name: offset for name, offset, _ in _named(c, k, stated)}).fillna(0.0)
+        usual = residual.groupby(pair).transform(lambda each: each.rolling(WINDOW, 1, center=True).median())
+        off = (residual - usual).to_numpy()  # errors of the filters last longer than that window
+        noise = robust_std(off)
+        least = np.maximum(max(noise, 0.2 * stated), expected / 2)  # a direction of what is near hardly counts
         rows.append(
             {
                 "measurement": name,
                 "unit": unit,
                 "number": len(residual),
                 "median": float(np.median(residual)),
-                "robust_std": robust_std(np.concatenate(less)),
+                "robust_std": robust_std((residual - known).to_numpy()),
                 "stated_std": stated,
-                "expected_std": float(np.sqrt(np.mean(c.expected[there, k] ** 2))),
+                "expected_std": float(np.sqrt(np.mean(expected**2))),
                 "noise": noise,
                 "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * least)),
             }
@@ -155,9 +153,9 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
     whom else it fits."""
     links, ids, measured = c.world.links, c.world.ids, c.world.relative[0, :, 0]
     found = dict[tuple[str, str], tuple[float, str]]()
-    there, t = np.isfinite(c.relative[:, k]), c.world.t - c.world.t[0]
-    for one, other in np.unique(np.column_stack([links.observer, links.neighbour])[there], axis=0).tolist():
-        rows = np.flatnonzero(there & (links.observer == one) & (links.neighbour == other))
+    t, names = c.world.t - c.world.t[0], pairs(c, k, True)
+    for rows in names.groupby(names).groups.values():
+        one, other = links.observer[rows[0]], links.neighbour[rows[0]]
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
         bad = long_off(np.abs(wrap(less) if k else less) / expected)

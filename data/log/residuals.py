@@ -10,7 +10,7 @@ from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.poses.pose_inputs import SPREAD
-from coopoc.world.body_frames import midway, turned
+from coopoc.world.body_frames import in_world
 from coopoc.world.links import spherical, stretches, wrap
 
 from .read import Log
@@ -130,8 +130,8 @@ def _moving(rec: Recording) -> list[int]:
 def filtered(log: Log) -> Check:
     """The log with a Kalman filter of each vehicle alone, in body frames a pose filter; and the residuals of relative
     measurements against these filters, with the deviations that they should have."""
-    span, start, body = "", "", log.recording.body is not None
-    if body:
+    span, start = "", ""
+    if log.recording.body is not None:
         log, span = together(log)
     rec = log.recording.of_runs(slice(0, 1))
     steps, vehicles, links = len(rec.t), len(rec.ids), rec.links
@@ -140,36 +140,27 @@ def filtered(log: Log) -> Check:
     marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), np.inf)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
     scored = x, variance
-    if body:
+    if rec.body is None:
+        track = Kalman(robust=False)(rec, [column for column in range(vehicles) if rec.stretches(column)])
+    else:
         begin, spread, start = begin_of(log)
         filter_ = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)
-        parts = [(0, steps, filter_(rec, _moving(rec)))]
+        track = filter_(rec, _moving(rec))
         if log.truth is not None:
-            track = replace(filter_, unit="fleet")(rec, _moving(rec))
+            fleet = replace(filter_, unit="fleet")(rec, _moving(rec))
             scored = x.copy(), variance.copy()
-            scored[0][:, track.egos], scored[1][:, track.egos] = track.x[0], _variance(track)
-    else:
-        stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
-        parts = [
-            (first, last, Kalman(robust=False)(rec.between(first, last), [column])) for column, first, last in stretches
-        ]
-    for first, last, track in parts:
-        there, columns, part = slice(first, last), list(track.egos), rec.between(first, last)
-        squares = normalised_innovations(track, part)
-        assert squares is not None
-        x[there, columns], fix[there, columns] = track.x[0], fix_innovations(track, part)[0]
-        variance[there, columns] = _variance(track)
-        normalised[there, columns] = squares[0]
-        for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
-            lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]
-        if track.heading is not None and track.heading_covariance is not None:
-            heading[there, columns] = track.heading[0]
-            heading_variance[there, columns] = track.heading_covariance[0, ..., 3]
+            scored[0][:, fleet.egos], scored[1][:, fleet.egos] = fleet.x[0], _variance(fleet)
+    columns, squares = list(track.egos), normalised_innovations(track, rec)
+    assert squares is not None
+    x[:, columns], variance[:, columns] = track.x[0], _variance(track)
+    fix[:, columns], normalised[:, columns] = fix_innovations(track, rec)[0], squares[0]
+    for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
+        lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]
+    if track.heading is not None and track.heading_covariance is not None:
+        heading[:, columns], heading_variance[:, columns] = track.heading[0], track.heading_covariance[0, ..., 3]
     world, noise = rec, rec.sensors
-    if body:
-        relative = rec.relative.copy()
-        relative[..., 1] = wrap(relative[..., 1] + heading[links.step, links.observer])
-        world = replace(rec, body=None, velocity=turned(rec.velocity, midway(heading)), relative=relative)
+    if rec.body is not None:
+        world = in_world(replace(rec, body=replace(rec.body, heading=heading[None])))
     gap, residual = residual_of(world, x)
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
     flat, distance = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))

@@ -113,29 +113,30 @@ def _wide(
     frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
 ) -> pd.DataFrame:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
-    value = {kind: "arrival" if kind == "message" else kind for kind in KINDS if kind not in ignore}
-    value = {kind: column for kind, column in value.items() if column in frame}
-    columns = [] if "partner" in frame else [*map(str, frame.select_dtypes("number").columns)]
-    beside = {column: found for column in columns if (found := _of_partner(column))}
-    if not (value or beside):
+    columns: dict[str, tuple[str, dict[str, str]]]
+    columns = {"arrival" if kind == "message" else kind: (kind, {}) for kind in KINDS}
+    for name in () if "partner" in frame else map(str, frame.select_dtypes("number")):
+        if named := _of_partner(name):
+            columns[name] = named[0], {"partner": named[1]}
+    columns = {name: of for name, of in columns.items() if name in frame and of[0] not in ignore}
+    if not columns:
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
         raise missing_column(file, "kind", frame, allowed, more=' Or name the columns: kinds={"...": "speed_kmh"}.')
-    if "std" in frame and {KINDS[kind].group for kind in value} == {"fix"}:
-        summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(value)}")
-        frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
-    used = ["t", "vehicle", "partner", *value.values(), *(f"{name}_std" for name in (*value, *beside)), *beside]
+    own = [name for name, (_, partner) in columns.items() if not partner]
+    if "std" in frame and {KINDS[columns[name][0]].group for name in own} == {"fix"}:
+        summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(own)}")
+        frame = frame.assign(**{f"{name}_std": frame["std"] for name in own}).drop(columns="std")
+    used = ["t", "vehicle", "partner", *columns, *(f"{name}_std" for name in columns)]
     for column in frame.columns.difference(used, sort=False):
         near = f"Did you mean {near}?" if (near := usual_key(column)) and "partner" not in frame else ""
         like = near or suggestion(column, (*LONG, *KINDS), "")
         if column == "std":
-            like = f"which belongs to no kind (name it {next(iter(value))}_std)"
+            like = f"which belongs to no kind (name it {next(iter(columns))}_std)"
         summary.leave(f"{file}: column {column}{', ' * bool(like)}{like}", len(frame))
-    parts = [_cells(frame[filled(frame[c])].assign(kind=kind), file, kind, f"{kind}_std") for kind, c in value.items()]
-    for column, (kind, partner) in beside.items():
-        if kind not in ignore:
-            part = frame[filled(frame[column])].assign(kind=kind, partner=partner)
-            parts.append(_cells(part, file, column, f"{column}_std"))
-    return pd.concat(parts)
+    return pd.concat(
+        _cells(frame[filled(frame[name])].assign(kind=kind, **partner), file, name, f"{name}_std")
+        for name, (kind, partner) in columns.items()
+    )
 
 
 def _of_partner(column: str) -> tuple[str, str] | None:
