@@ -103,7 +103,7 @@ def machine() -> str:
 
 def _made(recipe: str, progress: bool) -> dict[str, Checkpoint]:
     wanted = jobs(recipe)
-    return dict(zip(wanted, trained(list(wanted.values()), load_fleet(CLIENTS), progress), strict=True))
+    return {name: trained(job, load_fleet(CLIENTS), progress) for name, job in wanted.items()}
 
 
 def metrics(method: Method, runs: int = 20) -> dict[str, dict[str, float]]:

@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from itertools import starmap
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -101,7 +100,8 @@ def train_all(
 
 def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progress: bool) -> None:
     """Train and save the checkpoints of one recipe."""
-    for job, checkpoint in zip(group, trained(group, fleet, progress), strict=True):
+    for job in group:
+        checkpoint = trained(job, fleet, progress)
         if worst < math.inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
             allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
             hint = "Give more data or another recipe; --worse saves it all the same."
@@ -109,15 +109,11 @@ def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progres
         save(out / f"{job.label}.safetensors", checkpoint)
 
 
-def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[Checkpoint]:
-    """Checkpoints of jobs of one recipe, trained now."""
-    drawn = {job.setting: job_clients(job, fleet) for job in group}
-    data = {job: _own(job, drawn[job.setting]) for job in group}
-    models = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
-    return [
-        replace(made, card=_card(job, fleet, data[job]) | dict(made.card))
-        for job, made in zip(group, models, strict=True)
-    ]
+def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
+    """The checkpoint of a job, trained now."""
+    data = _own(job, job_clients(job, fleet))
+    made = TRAINERS[job.recipe.kind](job, data, f"train {job.name}" if progress else None)
+    return replace(made, card=_card(job, fleet, data) | dict(made.card))
 
 
 def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
@@ -148,8 +144,7 @@ def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, worst: float, lin
     _train(group, fleet, out, worst, line is not None)
 
 
-Data = dict[Job, Sequence[Client]]
-Trainer = Callable[[Sequence[Job], Data, str | None], list[Checkpoint]]
+Trainer = Callable[[Job, Sequence[Client], str | None], Checkpoint]
 
 
 def _made(path: Path, key: str) -> bool:
@@ -178,32 +173,25 @@ def _joined(data: Sequence[Client], part: str) -> Segments:
     return Segments.join([getattr(c, part) for c in data])
 
 
-def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    made, plan = [], todo[0].recipe.plan
-    for job in todo:
-        how = plan.rounds, plan.aggregate, plan.local_epochs, job.setting.seed, plan.schedule, stage
-        fed = federate(untrained(job), data[job], *how)
-        made.append(Checkpoint(fed.model.calibrate([c.training for c in data[job]]), fed.card, fed.weights))
-    return made
+def _federated(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
+    plan = job.recipe.plan
+    how = plan.rounds, plan.aggregate, plan.local_epochs, job.setting.seed, plan.schedule, stage
+    done = federate(untrained(job), data, *how)
+    return Checkpoint(done.model.calibrate([client.training for client in data]), done.card, done.weights)
 
 
-def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    made = []
-    for job in todo:
-        training, validation, long = (_joined(data[job], part) for part in ("training", "validation", "long"))
-        how = job.recipe.schedule, job.setting.seed, stage, long, str(job.client or "")
-        done = fit(untrained(job), training, validation, *how)
-        rows = [
-            {name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in done.history
-        ]
-        card = {"history": rows, "best": done.best.step, "stopped": done.stopped, "seconds": done.seconds}
-        made.append(Checkpoint(done.model, card, torch.stack([row.weights for row in done.history])))
-    return made
+def _fitted(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
+    training, validation, long = (_joined(data, part) for part in ("training", "validation", "long"))
+    how = job.recipe.schedule, job.setting.seed, stage, long, str(job.client or "")
+    done = fit(untrained(job), training, validation, *how)
+    rows = [{name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in done.history]
+    card = {"history": rows, "best": done.best.step, "stopped": done.stopped, "seconds": done.seconds}
+    return Checkpoint(done.model, card, torch.stack([row.weights for row in done.history]))
 
 
-def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    tasks = [(_joined(data[job], "training"), _joined(data[job], "validation")) for job in todo]
-    return list(starmap(Checkpoint, fit_okf(tasks, todo[0].recipe.schedule.epochs, progress=stage)))
+def _okf(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
+    training, validation = (_joined(data, part) for part in ("training", "validation"))
+    return Checkpoint(*fit_okf(training, validation, job.recipe.schedule.epochs, stage))
 
 
 TRAINERS: dict[str, Trainer] = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

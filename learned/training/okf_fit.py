@@ -1,7 +1,7 @@
 """fit_okf: train the nine parameters of an OptimisedKF on all segments at once, in double precision."""
 
+import math
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,55 +16,51 @@ from .machine import one_core, watched
 
 @one_core()
 def fit_okf(
-    tasks: Sequence[tuple[Segments, Segments]],
+    training: Segments,
+    validation: Segments,
     steps: int = 300,
     progress: str | None = None,
-) -> list[tuple[NoiseParameters, dict[str, Any]]]:
-    """Train noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2, of several
-    settings at once.
+) -> tuple[NoiseParameters, dict[str, Any]]:
+    """Train noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
 
     The estimates depend on ratios of variances only, so the loss cannot see a common factor per axis; that factor is
     set afterwards so that the training innovations have the variance that the filter claims for them.
 
     Args:
-        tasks: of each setting the segments to train on, and those that select the parameters.
+        training: segments to train on.
+        validation: segments that select the parameters.
         steps: of Adam on all training segments.
         progress: name of the stage of a progress bar on stderr.
 
     Returns:
-        Of each setting the trained parameters, the validation loss per check, m^2, and the training seconds.
+        The trained parameters; the validation loss per check, m^2, and the training seconds.
 
     >>> import numpy as np
     >>> from coopoc.learned import clients
     >>> from coopoc.world.fleet import Fleet
     >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
-    >>> len(fit_okf([(only.training, only.validation)], steps=2)[0][1]["validation_loss"])
+    >>> len(fit_okf(only.training, only.validation, steps=2)[1]["validation_loss"])
     2
     """
     began, like = time.perf_counter(), NoiseParameters()
-    data, judge = (_doubled(*padded([task[i] for task in tasks])) for i in range(2))
-    logs = like.logs.detach().double().flatten().repeat(len(tasks), 1).requires_grad_()
+    data, judge = (_doubled(*padded([part])) for part in (training, validation))
+    logs = like.logs.detach().double().reshape(1, -1).clone().requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
-    lowest, best, history = torch.full((len(tasks),), torch.inf, dtype=torch.float64), logs.detach().clone(), []
+    best, history = logs.detach().clone(), list[float]()
     for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
-                validated = _loss(like, logs, *judge)
-            better = validated < lowest
-            best[better], lowest[better] = logs.detach()[better], validated[better]
-            history.append(validated.tolist())
+                validated = float(_loss(like, logs, *judge))
+            best = logs.detach().clone() if validated < min(history, default=math.inf) else best
+            history.append(validated)
         adam.zero_grad()
-        _loss(like, logs, *data).sum().backward()
+        _loss(like, logs, *data).backward()
         adam.step()
         fall.step()
     with torch.no_grad():
-        best = best.view(-1, 3, 3) + _calibration(like.stds(best), *data)[:, None]
-    seconds = (time.perf_counter() - began) / len(tasks)
-    losses = zip(*history, strict=True)
-    return [
-        (like.with_logs(row), {"validation_loss": h, "seconds": seconds}) for row, h in zip(best, losses, strict=True)
-    ]
+        made = like.with_logs(best.view(3, 3) + _calibration(like.stds(best), *data))
+    return made, {"validation_loss": tuple(history), "seconds": time.perf_counter() - began}
 
 
 def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
@@ -74,11 +70,11 @@ def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
 
 
 def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
-    """(S,) mean over pieces and time of the squared error, m^2."""
+    """(1,) mean over pieces and time of the squared error, m^2."""
     return (like.losses(logs, batch) * weight).sum(1)
 
 
 def _calibration(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
-    """(S, 3) logarithm of the factor per axis that gives the normalised innovations unit variance."""
+    """(1, 3) logarithm of the factor per axis that gives the normalised innovations unit variance."""
     normalised = scan(numbers, batch)[1]
     return log_scale((over_time(normalised.square(), normalised.isfinite()) * weight[..., None]).sum(1))
