@@ -213,9 +213,7 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         radians("headings of begin", first[3:])
-        spread = np.array(self.spread, dtype=float)
-        noise = self.noise(self.assumed, dt)
-        return PoseStream(noise, self.options(noise), first, spread, dt)
+        return PoseStream(*self.settings(self.assumed, dt), first, np.array(self.spread, dtype=float), dt)
 
     def run_filter(
         self,
@@ -239,30 +237,20 @@ class PoseFilter:
         from ...kernels.poses.ekf import run_filter
         from ...kernels.poses.scalar_update import new_poses
 
-        noise = self.noise(self.assumed or recording.sensors, recording.dt)
-        options = self.options(noise)
+        noise, options = self.settings(self.assumed or recording.sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
         first, spread = begin.reshape(len(begin), -1, *begin.shape[-2:]), np.array(self.spread, dtype=float)
         first = np.ascontiguousarray(first[:, :, members])
         return run_filter(measured, noise, first, spread, options, *memory)
 
-    def noise(self, sensors: Sensors, dt: float) -> "PoseNoise":
-        """What it assumes, as the kernel takes it."""
-        assumed = pose_noise(sensors, dt, self.gate)
-        lasting = any(assumed.lasting) if self.lasting is None else self.lasting
-        assumed = assumed if lasting else assumed._replace(longer=0.0, lasting=(0.0, 0.0, 0.0))
-        return assumed if self.robust else assumed._replace(gate=np.inf)
-
-    def options(self, noise: "PoseNoise") -> "PoseOptions":
-        """As the kernel takes them."""
+    def settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
+        """What it assumes, and its options, as the kernel takes them."""
         from ...kernels.poses.ekf import PoseOptions
 
-        return PoseOptions(
-            4 + 2 * (self.lasting is True or any(noise.lasting)) + int(noise.longer),
-            PASSES if self.exact else 1,
-            get_args(Fusion).index(self.fusion),
-        )
+        noise = pose_noise(sensors, dt, self.gate if self.robust else np.inf, self.lasting is not False)
+        numbers = 4 + 2 * (self.lasting is True or any(noise.lasting)) + int(noise.longer)
+        return noise, PoseOptions(numbers, PASSES if self.exact else 1, get_args(Fusion).index(self.fusion))
 
 
 def pose_start(recording: Recording, *, seconds: float = START, gate: float = START_GATE) -> Floats:

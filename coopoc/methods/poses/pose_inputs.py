@@ -80,27 +80,30 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
     return poses
 
 
-def pose_noise(sensors: Sensors, dt: float, gate: float) -> "PoseNoise":
+def pose_noise(sensors: Sensors, dt: float, gate: float, lasting: bool = True) -> "PoseNoise":
     """What a pose filter assumes of its sensors.
 
     Args:
         sensors: that a method may know.
         dt: s.
         gate: standard deviations of an innovation beyond which a measurement is left out.
+        lasting: whether errors that last are states, where the sensors have any.
     """
     from ...kernels.poses.odometry import PoseNoise
 
     x, y, z = (float(std * std) for std in sensors.fix_std)
     compass = max(float(np.hypot(sensors.heading_std, sensors.heading_bias_std)), LEAST_HEADING_STD)
     a, b, c = (float(std * std) for std in sensors.relative_std)
+    lasts = (sensors.speed_scale_std, sensors.yaw_rate_bias_std, sensors.range_offset_std) if lasting else (0.0,) * 3
+    scale, bias, offset = (std**2 for std in lasts)
     return PoseNoise(
         fix=(x, y, z),
         heading=compass**2,
         relative=(a, b, c),
         odometer=sensors.motion_noise(1.0),
         yaw_rate=max(sensors.yaw_rate_std, LEAST_YAW_RATE_STD) ** 2,
-        lasting=(sensors.speed_scale_std**2, sensors.yaw_rate_bias_std**2, sensors.range_offset_std**2),
-        longer=float(sensors.range_offset_std > 0),
+        lasting=(scale, bias, offset),
+        longer=float(offset > 0),
         keep=float(np.exp(-dt / sensors.odometry_error_time)),
         flat=FORGOTTEN,
         gate=float(gate) * float(gate),
