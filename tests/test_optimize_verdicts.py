@@ -74,6 +74,20 @@ def test_a_saddle_between_two_anchors_is_one():
     assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
 
 
+def test_ranges_that_do_not_meet_are_noted():
+    """Closed form: ranges of 3 m to anchors 10 m apart are each 2 m off in the middle, and nothing is spare."""
+    found = solve(ranged(np.array([[0, 0], [10, 0.0]]), np.array([5, 1.0]), np.full(2, 3.0), 1.0))
+    assert found.cost == pytest.approx(4.0)
+    assert "explains 0" in found.notes[-1]
+
+
+@pytest.mark.parametrize("std", [1e-5, 1e-6])
+def test_odometry_of_micrometres_beside_a_fix_of_a_metre_is_known(std):
+    problem = Problem("abc").add("position", ["a", "c"], [[0, 0, 0], [2, 1, 0]], std=1.0)
+    found = solve(problem.add("displacement", [(0, 1), (1, 2)], [[1, 0, 0], [1, 0, 0]], std=std))
+    assert found.covariance[1].diagonal() == pytest.approx(0.5, rel=1e-3)
+
+
 def test_a_certified_mirror_image_is_not_unique():
     anchors = np.array([[0, 0], [10, 0.0]])
     pair = ranged(anchors, np.array([5, 1.0]), np.array([7, 8.0]), 1.0)

@@ -23,7 +23,7 @@ ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge m
     "relative_point": ("pose", "point"),
     "ranges": ("any", "any"),
 }
-NAME = re.compile(r"[A-Za-z](0|[1-9][0-9]{0,14})")
+NAME = re.compile(r"[A-Za-z](0|[1-9][0-9]{0,16})")
 ROUNDING = 1e-9
 """What may be left below zero, or unequal, of the largest eigenvalue or entry."""
 Location = Callable[[str, int], str]

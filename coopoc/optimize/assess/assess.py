@@ -216,10 +216,12 @@ def _unobservable(
     across their line by the curvature of ranges that are too short, and pushed off it by longer ones. A gradient bends
     a direction that nothing sees by as much as its share: along a circle about an anchor by |g| / radius.
     """
-    from scipy.sparse import eye_array
+    from scipy.sparse import diags_array, eye_array
 
     ways = eye_array(J.shape[1], format="csc") if active is None else active.exact
-    J = (J @ ways).tocsc()
+    J = J @ ways
+    largest = abs(J).max(axis=1).toarray().ravel()
+    J = (diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J).tocsc()  # the weights of rows hide no direction
     length = np.sqrt(J.power(2).sum(axis=0))
     measured = length > 0
     null = _null_rows(J[:, measured], length[measured])
@@ -417,8 +419,10 @@ def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
 def implausible(cost: float, mean: float, variance: float) -> bool:
     """Whether a cost lies in the upper TAIL of 2 cost / g ~ chi-square with h degrees of freedom, g = variance / mean
     and h = 2 mean / g, which has this mean and variance (Satterthwaite); g = 1 but for angles of rotation matrices."""
-    if cost <= mean + 3.0 * np.sqrt(variance) or not mean > 0:
+    if cost <= max(mean, 0.5) + 3.0 * np.sqrt(max(variance, 0.5)):  # no less than one spare number explains
         return False
+    if not mean > 0:
+        return True
     from scipy.special import gammaincc
 
     scale = variance / mean
