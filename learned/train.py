@@ -45,8 +45,8 @@ def train_all(
 ) -> dict[str, Checkpoint]:
     """Train every recipe in every setting, or read it from `out` where the same was trained before.
 
-    Recipes are trained side by side on `jobs` cores, each on one. A checkpoint is reused if its card's key, the hash of
-    all that changes the weights, is the same; each is written whole or not at all.
+    Checkpoints are trained side by side on `jobs` cores, each on one. One is reused if its card's key, the hash of all
+    that changes the weights, is the same; each is written whole or not at all.
 
     Args:
         data: the clients' drives: a fleet, such as the bundled "town10-clients", whose measurements are simulated, or a
@@ -78,35 +78,34 @@ def train_all(
     }
     seeds, starts, readings, recipes = (listed(name, v, f"Give {name}=[...].") for name, v in arguments.items())
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
-    wanted = {
-        name: [job for setting in settings for job in jobs_of(name, setting, fleet, aggregate)] for name in recipes
-    }
-    paths = {job: out / f"{job.label}.safetensors" for group in wanted.values() for job in group}
-    groups = ([job for job in group if not _made(paths[job], job.key(fleet))] for group in wanted.values())
-    missing = [group for group in groups if group]
+    wanted = [job for name in recipes for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
+    paths = {job: out / f"{job.label}.safetensors" for job in wanted}
+    missing = [job for job, path in paths.items() if not _made(path, job.key(fleet))]
     if jobs > 1 and len(missing) > 1:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
             todo = [
-                pool.submit(_in_worker, group, fleet, out, worst, line if progress else None, os.getpid())
-                for line, group in enumerate(missing)
+                pool.submit(_in_worker, job, fleet, out, worst, k % jobs if progress else None, os.getpid())
+                for k, job in enumerate(missing)
             ]
-            for done in todo:
-                done.result()
+            try:
+                for done in todo:
+                    done.result()
+            finally:
+                pool.shutdown(cancel_futures=True)
     else:
-        for group in missing:
-            _train(group, fleet, out, worst, progress)
+        for job in missing:
+            _train(job, fleet, out, worst, progress)
     return {job.label: load(path, job.recipe.net if in_file(job.recipe.net) else "") for job, path in paths.items()}
 
 
-def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progress: bool) -> None:
-    """Train and save the checkpoints of one recipe."""
-    for job in group:
-        checkpoint = trained(job, fleet, progress)
-        if worst < math.inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
-            allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
-            hint = "Give more data or another recipe; --worse saves it all the same."
-            raise InputError(f"validation error of {job.label}", f"{times:.2f} times", allowed, hint)
-        save(out / f"{job.label}.safetensors", checkpoint)
+def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> None:
+    """Train and save a checkpoint."""
+    checkpoint = trained(job, fleet, progress)
+    if worst < math.inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
+        allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
+        hint = "Give more data or another recipe; --worse saves it all the same."
+        raise InputError(f"validation error of {job.label}", f"{times:.2f} times", allowed, hint)
+    save(out / f"{job.label}.safetensors", checkpoint)
 
 
 def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
@@ -138,10 +137,10 @@ def _drives(segments: Segments) -> tuple[Recording, Fleet]:
     return replace(recording, gnss=gnss[None], velocity=velocity[None]), fleet
 
 
-def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
+def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
     leave_with(parent)
     LINE.set(line or 0)
-    _train(group, fleet, out, worst, line is not None)
+    _train(job, fleet, out, worst, line is not None)
 
 
 Trainer = Callable[[Job, Sequence[Client], str | None], Checkpoint]

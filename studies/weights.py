@@ -88,7 +88,7 @@ def _jobs(recipe: str, digest: str, clients: str, *setting: Any) -> list[tuple[s
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
-    """Train the missing weights of the cells, with progress: `jobs` recipes at a time."""
+    """Train the missing weights of the cells, with progress: `jobs` checkpoints at a time."""
     wanted: dict[tuple[str, str, int], list[Params]] = {}
     for p in cells:
         if is_trained(p["method"]):
