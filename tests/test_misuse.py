@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from random_graphs import PAIR
 
 import coopoc as co
 from coopoc import optimize
@@ -161,9 +162,6 @@ def test_a_stream_that_refused_a_step_is_as_before():
     assert np.array_equal(start().step(*given)[0], before)
 
 
-PROBLEM = co.Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
-
-
 TOWN = co.load_fleet("town10").between(0, 40).select([8, 9, 10, 11])
 TOWN = replace(TOWN, heading=true_heading(TOWN))
 SEEN = co.observe(TOWN, SENSORS, CHANNEL, runs=2)
@@ -191,7 +189,7 @@ def star(gnss: Any, velocity: Any, dt: Any, fix_age: Any, **neighbour: Any) -> A
 
 
 def least_squares(nodes: Any, z: Any, std: Any, x0: Any) -> Any:
-    return co.solve(replace(PROBLEM, x0=x0).add("range", nodes, z, std=std)).x
+    return co.solve(replace(PAIR, x0=x0).add("range", nodes, z, std=std)).x
 
 
 FOLLOWED: dict[str, Any] = {"recording": SEEN, "egos": [0, 1]}
@@ -254,10 +252,10 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         least_squares,
         {"nodes": ("a", "b"), "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])},
     ),
-    "solve": (lambda **given: co.solve(**given).x, {"problem": PROBLEM, "backend": "gauss-newton"}),
+    "solve": (lambda **given: co.solve(**given).x, {"problem": PAIR, "backend": "gauss-newton"}),
     "incremental": (
         lambda **given: co.incremental(**given)[0],
-        {"problem": PROBLEM, "relinearizeThreshold": 0.1, "relinearizeSkip": 1, "wildfireThreshold": 1e-3, "lag": 2},
+        {"problem": PAIR, "relinearizeThreshold": 0.1, "relinearizeSkip": 1, "wildfireThreshold": 1e-3, "lag": 2},
     ),
     "pose": (co.pose, {"position": np.zeros((4, 2)), "turn": np.full(4, 0.7)}),
 }
@@ -356,7 +354,7 @@ def test_a_wrong_argument_gives_an_error_of_ours_a_right_number_or_a_note(name):
 
 
 def test_solvers_refuse_arguments_of_the_wrong_kind():
-    whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
+    whole = PAIR.add("range", ("a", "b"), 10.0, std=1.0)
     solution = co.solve(whole)
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
     with refused("nodes = 10000 nodes: must name each of 2 nodes once"):
@@ -366,8 +364,8 @@ def test_solvers_refuse_arguments_of_the_wrong_kind():
     swept(solution.__getitem__, {"point": "a"})
     swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))})
     swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
-    swept(PROBLEM.add, {"kind": "range", "nodes": ("a", "b"), "z": 9.0, "std": 1.0, "loss": None})
-    swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0})
+    swept(PAIR.add, {"kind": "range", "nodes": ("a", "b"), "z": 9.0, "std": 1.0, "loss": None})
+    swept(PAIR.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0})
     window = {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None}
     swept(co.Problem.from_window, window)
     named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}

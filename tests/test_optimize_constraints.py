@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
+from random_graphs import PAIR
 from scipy.linalg import null_space
 from scipy.optimize import LinearConstraint, NonlinearConstraint, lsq_linear, minimize
 
@@ -31,7 +32,6 @@ from coopoc.optimize.assess.active import active_at
 INF = np.inf
 LINEAR: list[tuple[str, dict[str, str]]] = [("osqp", {}), ("casadi", {})]
 ANY = LINEAR[1:]
-PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 RANGED = PAIR.add("range", ("a", "b"), 8.0, std=0.5)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import refused
 from oracles.whitened import whitened
+from random_graphs import PAIR
 
 from coopoc import V2X, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import Factor, Loss, Problem, SolveError, Status, pose, solve
@@ -16,7 +17,6 @@ from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import to_vector, vector_cov
 
 S2 = Sensors.paper_scenario2()
-PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 
 
 @pytest.fixture(scope="module")

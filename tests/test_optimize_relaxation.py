@@ -14,50 +14,33 @@ import tightness
 from conftest import measured, refused
 from scipy.io import mmread
 from scipy.optimize import least_squares
-from test_optimize_poses import relative
+from unseen_graphs import World
 
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Solution, Status, solve
 from coopoc.optimize.convex import certify, reduced, shor
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
 from coopoc.optimize.convex.reduced import Reduced
-from coopoc.optimize.graph_problems import read_graph
-from coopoc.optimize.model.space import Space, exp
+from coopoc.optimize.graph_problems import from_graph, read_graph
+from coopoc.optimize.model.space import exp
 
 UP = 0.6
 """Vertical against horizontal std in anisotropic problems."""
 
 
-def swarm(seed: int, d: int = 3, vehicles: int = 4, gnss_std: float = 3.5, up: float = 1.0) -> Problem:
-    """Fixes and the ranges of all pairs; `up` stretches the last axis of the fixes' std."""
-    rng = np.random.default_rng(seed)
-    truth, std = rng.uniform(-20, 20, (vehicles, d)), gnss_std * np.array([*np.ones(d - 1), up])
-    names = [f"v{i}" for i in range(vehicles)]
-    pairs = [(i, j) for i in range(vehicles) for j in range(i + 1, vehicles)]
-    ranges = [np.linalg.norm(truth[i] - truth[j]) + rng.standard_normal() for i, j in pairs]
-    problem = Problem(tuple(names), dimension=d).add(
-        "position", names, truth + std * rng.standard_normal(truth.shape), std
-    )
-    return problem.add("range", pairs, np.abs(ranges)[:, None], 1.0)
+swarm = partial(tightness.ranged, vehicles=4, mesh=True)
+"""Fixes and the ranges of all pairs."""
 
 
-def two_robots(seed: int, d: int = 2, fixed: bool = False, noise: float = 1.0, prior: bool = False) -> Problem:
+def two_robots(seed: int, d: int = 2, fixed: bool = False, prior: bool = False) -> Problem:
     """Odometry of two robots as chordal relative poses and ranges between them; nothing in the world's frame, but a
     prior of the first pose."""
-    rng, steps, space = np.random.default_rng(seed), 4, Space(d, has_rotation=True)
-    turn, at = exp(rng.uniform(-3, 3, (2 * steps, space.angles))), rng.uniform(-5, 5, (2 * steps, d))
-    names, x = tuple(f"{robot}{k}" for robot in "AB" for k in range(steps)), space.join(at, turn)
-    problem = Problem(names, x0=x, dimension=d, poses=range(2 * steps), fixed=(0,) if fixed else ())
-    pairs = [(k, k + 1) for k in range(2 * steps - 1) if k != steps - 1]
-    z = np.array([relative(space, x, pair) for pair in pairs])
-    z[:, :d] += 0.05 * noise * rng.standard_normal((len(z), d))
-    std = [0.05] * d + [0.02] * d * d
-    problem = problem.add("relative_pose_chordal", pairs, z, std)
-    if prior:
-        problem = problem.add("pose_chordal", 0, x[0], std)
-    across = [(i, j) for i in range(steps) for j in range(steps, 2 * steps)]
-    ranges = [np.linalg.norm(at[i] - at[j]) + 0.1 * noise * rng.standard_normal() for i, j in across]
-    return problem.add("range", across, np.abs(ranges)[:, None], 0.1)
+    rng = np.random.default_rng(seed)
+    w = World(rng, rng.uniform(-5, 5, (8, d)), exp(rng.uniform(-3, 3, (8, 2 * d - 3))), robots=2, steps=4)
+    odometry, ranges = w.relative(w.chain(), 0.05, 0.02), w.ranged(w.near(16, 30.0, others=True), 0.1)
+    whole = from_graph(w.graph(relative_pose=odometry, ranges=ranges), "chordal", "file")
+    problem = replace(whole, fixed=(0,) if fixed else ())
+    return problem.add("pose_chordal", 0, problem.x0[0], 0.05) if prior else problem
 
 
 def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
@@ -144,7 +127,7 @@ def test_matrices_are_coras(name):
 def test_the_bound_is_that_of_the_programme_written_out(d, up):
     """Matrix form (d + m rows) and stacked form have the value of [1; t; s][1; t; s]^T, solved by CVXPY."""
     for seed in range(3):
-        problem = swarm(seed, d, vehicles=3, up=up)
+        problem = swarm(seed, d=d, vehicles=3, stretch=up)
         assert quadratic(problem).stacked == (up != 1.0)
         assert shor(problem, refine=False).lower_bound == pytest.approx(by_hand(problem), rel=2e-5, abs=1e-6)
 
@@ -154,8 +137,8 @@ def test_the_bound_is_that_of_the_programme_written_out(d, up):
     [
         swarm,
         partial(swarm, d=2),
-        partial(swarm, up=UP),
-        partial(swarm, d=2, up=3.0),
+        partial(swarm, stretch=UP),
+        partial(swarm, d=2, stretch=3.0),
         two_robots,
         partial(two_robots, d=3, prior=True),
         partial(two_robots, fixed=True),
@@ -182,7 +165,9 @@ def test_no_point_beats_the_bounds(make, seed):
     assert relaxation.solution.cost <= relaxation.cost * (1 + 1e-9) + 1e-12
 
 
-@pytest.mark.parametrize("make", [swarm, partial(swarm, d=2), partial(swarm, up=UP), partial(two_robots, prior=True)])
+@pytest.mark.parametrize(
+    "make", [swarm, partial(swarm, d=2), partial(swarm, stretch=UP), partial(two_robots, prior=True)]
+)
 @pytest.mark.parametrize("seed", range(2))
 def test_tight_relaxations_reach_what_brute_force_reaches(make, seed):
     """scipy.optimize.least_squares from random starts finds nothing better, and its best is our solution."""
@@ -196,7 +181,7 @@ def test_tight_relaxations_reach_what_brute_force_reaches(make, seed):
 
 
 @pytest.mark.parametrize(
-    "make", [two_robots, partial(two_robots, d=3), partial(two_robots, fixed=True), swarm, partial(swarm, up=UP)]
+    "make", [two_robots, partial(two_robots, d=3), partial(two_robots, fixed=True), swarm, partial(swarm, stretch=UP)]
 )
 def test_the_elimination_is_numpys(make, monkeypatch):
     """C and its products by numpy.linalg.lstsq, eigenvalues by eigh and by Lanczos."""
