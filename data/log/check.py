@@ -24,7 +24,6 @@ from .estimates import (
     LONG_LAG,
     OUTLYING,
     SURE_ERRORS,
-    Estimate,
     against_truth,
     causes,
     factors,
@@ -118,6 +117,11 @@ def _without(c: Check, columns: Sequence[int]) -> Check:
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
     rows, rec, truth = [], c.world, c.log.truth
+    turned, late = (
+        "turned" if c.log.recording.body is None else "yaw_rate_bias",
+        "fixes_late_s" if truth is None else "late_s",
+    )
+    errors = {"speed_excess": 0, "beside_east": 3, "beside_north": 4, turned: 1, late: 2}
     for column, name in enumerate(rec.ids):
         fixed = np.isfinite(c.normalised[:, column])
         speed, fixes = np.linalg.norm(rec.velocity[0, :, column], axis=-1), pd.DataFrame(rec.gnss[0, :, column])
@@ -132,11 +136,12 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
             "nis": float(c.normalised[fixed, column].mean()) if fixed.any() else None,
             "fixes_per_odometry": None if ratio is None else abs(ratio),
             "turned_deg": None if ratio is None else float(np.angle(ratio, deg=True)),
-            **_with_error("speed_excess", wheels, 0),
-            **_with_error("beside_east", wheels, 3),
-            **_with_error("beside_north", wheels, 4),
-            **_with_error("turned" if c.log.recording.body is None else "yaw_rate_bias", wheels, 1),
-            **_with_error("fixes_late_s" if truth is None else "late_s", wheels, 2),
+            **{
+                f"{error}{end}": float(values[k])
+                for error, k in errors.items()
+                if np.isfinite(wheels.error[k])
+                for end, values in (("", wheels.value), ("_error", wheels.error))
+            },
             "clock_s": float(c.ahead[column]) if np.isfinite(c.unsure[column]) else None,
             "std_m": _rms(np.sqrt(c.variance[:, column])),
         }
@@ -146,13 +151,6 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
             row["error_per_std"], row["worst_at_s"] = worst(c, column)
         rows.append(row)
     return rows
-
-
-def _with_error(name: str, found: Estimate, k: int) -> dict[str, float | None]:
-    """Two columns of a table: an estimate and its standard error."""
-    if not np.isfinite(found.error[k]):
-        return {}
-    return {name: float(found.value[k]), f"{name}_error": float(found.error[k])}
 
 
 def _rms(vectors: Floats) -> float | None:
@@ -219,7 +217,7 @@ def _of_errors(c: Check) -> list[str]:
         f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what other lines name, or by "
         "noise that is not as stated."
         for row in sorted(c.vehicles, key=lambda row: -(row.get("error_per_std") or 0.0))
-        if (row.get("error_per_std") or 0.0) > CONFIDENT_RATIO
+        if _beyond(row, "error_per_std", CONFIDENT_RATIO)
     ]
 
 
@@ -275,7 +273,7 @@ def _of_vehicles(c: Check) -> list[str]:
                 "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
             )
             continue
-        elif row.get("speed_excess") is not None and _beyond(row, "speed_excess", LEAST_SCALE):
+        elif _beyond(row, "speed_excess", LEAST_SCALE):
             word = "fast" if row["speed_excess"] > 0 else "slow"
             sentences.append(
                 f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
@@ -320,7 +318,7 @@ def _drifts(row: Mapping[str, Any]) -> bool:
 
 def _off(row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row errs, or fixes do not fit it."""
-    return (row.get("nis") or 0.0) > OUTLYING or _drifts(row)
+    return _beyond(row, "nis", OUTLYING) or _drifts(row)
 
 
 def _of_clocks(c: Check) -> list[str]:
@@ -376,7 +374,7 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        wrong = max(row.get("nis") or 0.0, row.get("error_per_std") or 0.0) > OUTLYING
+        wrong = _beyond(row, "nis", OUTLYING) or _beyond(row, "error_per_std", OUTLYING)
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             way = "behind" if lag > 0 else "ahead of"
             sentences.append(

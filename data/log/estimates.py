@@ -392,8 +392,9 @@ def against_truth(c: Check) -> Check:
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(rec, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
-    relative, expected = (np.where(used, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
+    relative = np.where(used, residual, c.relative)
     fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)  # of others nothing is known
+    expected = np.where(used, stated, c.expected)
     return replace(c, relative=np.where(fit[:, None], relative, np.nan), expected=expected)
 
 

@@ -234,13 +234,11 @@ def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:
 
     Where fixes of deviation r a step hold a walk of errors s dt, m sqrt(m) is r / (s dt).
     """
-    steps, noise = dict[str, float](), dict[str, float]()
-    for name, kinds, usual in (("motion", MOTION, 0.0), ("fix", ("x",), Sensors().gnss_std[0])):
-        steps[name], stated = _apart(rows, kinds, dt), square.reindex(kinds).mean()
-        usual = usual or Sensors().velocity_std_ratio * np.nan_to_num(_once(rows, kinds)["value"].abs().mean())
-        noise[name] = np.sqrt(stated) if stated > 0.0 else usual
-    held = noise["fix"] * steps["fix"] ** 0.5 / max(noise["motion"] * dt, 1e-12)
-    return float(np.sqrt(min(max(held ** (2 / 3), 1.0), steps["motion"])))
+    base, pace = Sensors(), np.nan_to_num(_once(rows, MOTION)["value"].abs().mean())
+    motion, fix = np.sqrt([square.reindex(MOTION).mean(), square.get("x", np.nan)])
+    motion, fix = motion if motion > 0.0 else base.velocity_std_ratio * pace, fix if fix > 0.0 else base.gnss_std[0]
+    held = fix * _apart(rows, ["x"], dt) ** 0.5 / max(motion * dt, 1e-12)
+    return float(np.sqrt(min(max(held ** (2 / 3), 1.0), _apart(rows, MOTION, dt))))
 
 
 def _once(rows: Rows, kinds: Sequence[str]) -> Rows:

@@ -175,8 +175,8 @@ def read_log(
     summary, offset = Summary(path.name), named("offset", offset or {}, "Give offset={name: number}.")
     one_of("frame", frame, Frame)
     texts("ignore", ignore)
-    for field, flag in {"any_scale": any_scale, "mutual": mutual}.items():
-        instance(field, flag, bool, "Give True or False.")
+    instance("any_scale", any_scale, bool, "Give True or False.")
+    instance("mutual", mutual, bool, "Give True or False.")
     clocks = {f"clock of {name}": ahead for name, ahead in clock.items()}
     for field, value in {"dt": dt, "max_gap": max_gap, **clocks}.items():
         if value is not None:
