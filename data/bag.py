@@ -99,7 +99,7 @@ def read_bag(
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
     one_of("stamps", stamps, ("header", "received"))
-    messages, behind = dict[str, list[tuple[Any, ...]]](), list[float]()
+    messages, behind, parts = dict[str, list[tuple[Any, ...]]](), list[float](), dict[str, Rows]()
     folder = path.parent if path.suffix == ".db3" else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -124,24 +124,23 @@ def read_bag(
                 behind.append(arrived - sent)
                 values = attrgetter(*fields[c.topic])(message)
                 messages.setdefault(c.topic, []).append((number, sent if stamps == "header" else arrived, *values))
+        for topic, table in messages.items():
+            frame = pd.DataFrame(table, columns=["number", "t", *fields[topic]]).set_index("number")
+            for field in frame.columns[frame.columns.str.endswith("covariance")]:
+                matrix = pd.DataFrame(np.stack(frame[field].tolist()), frame.index)
+                frame = frame.join(matrix.add_prefix(f"{field}_"))
+            (vehicle, partner), true = of[topic]
+            kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
+            rows = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), path.name)
+            parts[topic] = rows[~rows["kind"].isin(ignore)]
     except InputError:
         raise
-    except Exception as error:  # of rosbags: a damaged file meets them all
+    except Exception as error:  # of rosbags and pandas: a damaged file meets them all
         raise InputError(path.name, said(error), "must be a ROS bag", "Record it again, or reindex it.") from None
     if behind:
         other = "received" if stamps == "header" else "header"
         spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"
         summary.assume(f"times are those of stamps={stamps}; headers are {spread} (stamps={other}: by the other)")
-    parts = dict[str, Rows]()
-    for topic, table in messages.items():
-        frame = pd.DataFrame(table, columns=["number", "t", *fields[topic]]).set_index("number")
-        for field in frame.columns[frame.columns.str.endswith("covariance")]:
-            matrix = pd.DataFrame(np.stack(frame[field].tolist()), frame.index)
-            frame = frame.join(matrix.add_prefix(f"{field}_"))
-        (vehicle, partner), true = of[topic]
-        kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
-        rows = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), path.name)
-        parts[topic] = rows[~rows["kind"].isin(ignore)]
     if all(rows["true"].all() for rows in parts.values()):
         types = ", ".join(name.rpartition("/")[2] for name in READ)
         raise InputError(path.name, "0 messages", f"must hold {types}", "Check the topics with: ros2 bag info.")
@@ -192,7 +191,9 @@ def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd
     frame = frame.rename(columns=lambda name: re.sub(r"\[(\d+)\]$", r"_\1", name))  # as several programs call it
     nano = next((name for name in ("header.stamp.nanosec", "header.stamp.nsec") if name in frame), None)
     t = numeric(frame, STAMP, file) + (1e-9 * numeric(frame, nano, file) if nano else 0.0)
-    known = {*FIELDS, *UNMEASURED, *" ".join([*READ.values(), POSE.replace("pose.", "pose.pose.")]).split()}
+    known = {*FIELDS, *UNMEASURED, "status.status", "position_covariance_type", *TURN.split()}
+    if true:
+        known.update(POSE.split(), POSE.replace("pose.", "pose.pose.").split())
     topic = {name: numeric(frame, name, file) for name in frame if name in known}
     return kinds_of(pd.DataFrame({"t": t, **topic}, frame.index), true, summary, file)
 

@@ -226,13 +226,21 @@ def test_topics_as_tables_are_the_bag(tmp_path):
         u = fleet.velocity[:, k]
         yaw, sec = np.arctan2(u[:, 1], u[:, 0]), np.floor(fleet.t + 1e-6).astype(int)
         stamp = {"header.stamp.sec": sec, "header.stamp.nanosec": np.rint(1e9 * (fleet.t - sec)).astype(int)}
-        status = np.where(np.arange(80) == 40, -1, 0)
-        turn = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+        status = -1 * (np.arange(80) == 40)
         variance = dict(zip(COVARIANCE[k], (k + 1) * np.array([0.25, 0.36, 0]), strict=True))
-        turned = {f"orientation.{axis}": value for axis, value in zip("xyzw", turn, strict=True)}
+        turned = {
+            "orientation.x": 0,
+            "orientation.y": 0,
+            "orientation.z": np.sin(yaw / 2),
+            "orientation.w": np.cos(yaw / 2),
+        }
         topics = {
             "gps/fix": {**variance, "status.status": status, "latitude": lat, "longitude": lon, "altitude": h},
-            "odom": {"pose.pose.position.x": 0.0, "twist.twist.linear.x": np.hypot(*u[:, :2].T)},
+            "odom": {
+                "pose.pose.position.x": 0.0,
+                "twist.twist.linear.x": np.hypot(*u[:, :2].T),
+                "twist.covariance[0]": 0.04,
+            },
             "imu": {**turned, "angular_velocity.z": np.gradient(np.unwrap(yaw), 0.1)},
         }
         for topic, columns in topics.items():
@@ -245,7 +253,8 @@ def test_topics_as_tables_are_the_bag(tmp_path):
     there = np.isfinite(log.recording.gnss[0, :, :, 0])
     assert_allclose(log.recording.gnss[0][there], fleet.position[there], atol=1e-5)
     assert_allclose(log.recording.velocity[0, 2:, :, :2], fleet.velocity[2:, :, :2], atol=0.06)
-    assert log.recording.sensors.gnss_std == pytest.approx(np.sqrt([1.5 * 0.25, 1.5 * 0.36, 2.25]))
+    sensors = log.recording.sensors
+    assert (*sensors.gnss_std, sensors.velocity_floor) == pytest.approx(np.sqrt([1.5 * 0.25, 1.5 * 0.36, 2.25, 0.04]))
 
 
 def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):

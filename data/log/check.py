@@ -85,7 +85,8 @@ def check(log: Log) -> Check:
     """Innovation statistics of a log, with the noise that its recording states.
 
     Raises:
-        InputError: in body frames, vehicles that share no two steps, or first poses that are not known.
+        InputError: no vehicle that a filter follows; in body frames, vehicles that share no two steps, or first poses
+            that are not known.
     """
     bar = progress_bar(desc=f"check of {log.summary.name}", total=len(CHECKS) + 2, delay=2.0)
     first = filtered(log)

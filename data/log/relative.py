@@ -198,8 +198,8 @@ def _other_angle(c: Check) -> str:
         "azimuths clockwise: change their sign": -2 * measured,
         f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}": -off,
     }
-    enough = {like: np.isfinite(residual + turn).sum() >= LEAST_COUNT for like, turn in causes.items()}
-    left = {like: np.nanmedian(np.abs(wrap(residual + causes[like]))) for like in causes if enough[like]}
+    rests = {like: np.abs(wrap(residual + turn)) for like, turn in causes.items()}
+    left = {like: np.nanmedian(rest) for like, rest in rests.items() if np.isfinite(rest).sum() >= LEAST_COUNT}
     if 3 * (least := min(left.values(), default=np.inf)) > np.median(np.abs(residual)):
         return ""
     return f"They look like {next(like for like, rest in left.items() if rest <= 1.5 * least)}."

@@ -141,7 +141,11 @@ def filtered(log: Log) -> Check:
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
     scored = x, variance
     if rec.body is None:
-        track = Kalman(robust=False)(rec, [column for column in range(vehicles) if rec.stretches(column)])
+        followed = [column for column in range(vehicles) if rec.stretches(column)]
+        if not followed:
+            allowed = "must hold a vehicle that is there at two steps in a row from a fix on"
+            raise InputError("log", log.summary.name, allowed, "Log fixes and odometry of the same time.")
+        track = Kalman(robust=False)(rec, followed)
     else:
         begin, spread, start = begin_of(log)
         filter_ = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)
