@@ -47,52 +47,6 @@ class Fronts(NamedTuple):
 
 
 @compiled
-def structures(indptr: Ints, indices: Ints, order: Ints) -> tuple[Ints, Ints, Ints]:
-    """Parent of each column in the elimination tree (n,), -1 for a root, and its rows below the diagonal, unsorted.
-
-    A column has the rows of its matrix and those of its children, the first of which is its parent.
-
-    Args:
-        indptr: (n + 1,) of the whole symmetric pattern; the diagonal counts for nothing.
-        indices: of its neighbours.
-        order: (n,) node that is eliminated as the k-th.
-
-    Returns:
-        parent (n,), index of the first row of each column (n + 1,), and the rows.
-    """
-    n = len(order)
-    index, marked, begin = np.empty(n, np.int64), np.full(n, -1), np.zeros(n + 1, np.int64)
-    parent, head, sibling = np.full(n, -1), np.full(n, -1), np.full(n, -1)
-    for k in range(n):
-        index[order[k]] = k
-    rows, count = np.empty(len(indices) + n, np.int64), 0
-    for k in range(n):
-        marked[k] = k
-        if count + n > len(rows):
-            wider = np.empty(2 * len(rows) + n, np.int64)
-            wider[:count] = rows[:count]
-            rows = wider
-        for e in range(indptr[order[k]], indptr[order[k] + 1]):
-            i = index[indices[e]]
-            if i > k and marked[i] != k:
-                marked[i], rows[count] = k, i
-                count += 1
-        child = head[k]
-        while child != -1:
-            for e in range(begin[child], begin[child + 1]):
-                i = rows[e]
-                if marked[i] != k:
-                    marked[i], rows[count] = k, i
-                    count += 1
-            child = sibling[child]
-        begin[k + 1] = count
-        if count > begin[k]:
-            parent[k] = rows[begin[k] : count].min()
-            sibling[k], head[parent[k]] = head[parent[k]], k
-    return parent, begin, rows[:count]
-
-
-@compiled
 def postorder(parent: Ints, size: Ints) -> Ints:
     """(n,) columns of a tree, each after its subtree, which is in one piece, and after the largest of its children.
 
@@ -126,7 +80,8 @@ def supernodes(parent: Ints, begin: Ints, rows: Ints, width: Ints) -> Ints:
 
     Args:
         parent: (n,) in the tree.
-        begin: (n + 1,) and rows: of `structures`.
+        begin: (n + 1,) index in `rows` of the first row of each column.
+        rows: below the diagonal.
         width: (n,) unknowns of each column.
     """
     n = len(parent)

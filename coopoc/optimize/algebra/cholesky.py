@@ -28,8 +28,7 @@ class Cholesky:
     Args:
         indptr: (u + 1,) of the upper triangle, CSC with sorted rows and no diagonal left out.
         indices: of its rows.
-        group: (u,) ascending, the node of each unknown; the last of a node has the neighbours of all. None: each is
-            alone.
+        group: (u,) ascending, the node of each unknown. None: each is alone.
 
     >>> cholesky = Cholesky(np.array([0, 1, 3]), np.array([0, 0, 1]))
     >>> cholesky.factor(np.array([2.0, 1.0, 2.0])), cholesky.solve(np.array([3.0, 3.0])).round(6)
@@ -158,48 +157,50 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     References:
         Amestoy, Davis, Duff, An approximate minimum degree ordering algorithm, SIAM J. Matrix Anal. 1996.
     """
-    from scipy.sparse import coo_array
+    from scipy.sparse import csc_array, csr_array
 
-    from ...kernels.graphs.multifrontal import Fronts, postorder, structures, supernodes
+    from ...kernels.graphs.multifrontal import Fronts, postorder, supernodes
 
-    name, begin, width = np.unique(group, return_index=True, return_counts=True)
-    n, last = len(name), begin + width - 1
-    which = np.repeat(np.arange(n), width)
-    length = np.diff(indptr)[last]
-    column = np.repeat(np.arange(n), length)
-    row = which[indices[_runs(indptr[last], length)]]
-    both = np.concatenate([row, column]), np.concatenate([column, row])
-    pattern = coo_array((np.ones(2 * len(row)), both), shape=(n, n)).tocsr()
-    both_ways = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
-    order = minimum_degree(*both_ways)
-    parent, at, _ = structures(*both_ways, order)
-    order = order[postorder(parent, np.diff(at))]
-    parent, at, below = structures(*both_ways, order)
-    head = supernodes(parent, at, below, width[order])
-    first = np.append(0, np.cumsum(width[order]))
-    top = head[1:] - 1
-    of = np.repeat(np.arange(len(top)), at[top + 1] - at[top])
-    rows = below[_runs(at[top], at[top + 1] - at[top])]
-    sort = np.lexsort((rows, of))
-    wide = width[order][rows[sort]]
-    count = np.bincount(of[sort], wide, len(top)).astype(np.int64)
-    columns = np.diff(first[head])
+    _, begin, width = np.unique(group, return_index=True, return_counts=True)
+    u, n = len(group), len(width)
+    of = csr_array((np.ones(u), np.repeat(np.arange(n), width), np.arange(u + 1)), shape=(u, n))
+    upper = of.T @ csc_array((np.ones(len(indices)), indices, indptr), shape=(u, u)) @ of
+    order, lower = eliminated((upper + upper.T).tocsc())
+    later = postorder(_parents(lower), np.diff(lower.indptr).astype(np.int64))
+    order, lower = order[later], lower[later][:, later]
+    lower.sort_indices()
+    begin, width = begin[order], width[order]
+    head = supernodes(_parents(lower), lower.indptr.astype(np.int64), lower.indices.astype(np.int64), width)
+    first, below = np.append(0, np.cumsum(width)), lower[head[1:] - 1]
+    rows, columns = below.indices, np.diff(first[head])
+    row = np.append(0, np.cumsum(width[rows]))[below.indptr]
     return Fronts(
-        _runs(begin[order], width[order]),
+        _runs(begin, width),
         first[head],
-        np.append(0, np.cumsum(count)),
-        _runs(first[rows[sort]], wide),
-        np.append(0, np.cumsum(columns * (columns + count))),
-        np.repeat(np.arange(len(top)), columns),
+        row,
+        _runs(first[rows], width[rows]),
+        np.append(0, np.cumsum(columns * (columns + np.diff(row)))),
+        np.repeat(np.arange(len(columns)), columns),
     )
 
 
-def minimum_degree(indptr: Ints, indices: Ints) -> Ints:
-    """(n,) which of a symmetric pattern's nodes is eliminated as the k-th, by CasADi's AMD."""
+def eliminated(pattern: Any) -> tuple[Ints, Any]:
+    """The order (n,) in which CasADi's AMD eliminates nodes of a symmetric pattern, and L's below the diagonal in that
+    order, CSR of its transpose: the rows of each column, ascending, the first of which is its parent in the elimination
+    tree."""
     import casadi as ca
+    from scipy.sparse import csc_array
 
-    n = len(indptr) - 1
-    return np.array(ca.Sparsity(n, n, indptr.tolist(), indices.tolist()).amd(), dtype=np.int64)
+    n = pattern.shape[0]
+    upper, order = ca.Sparsity(n, n, pattern.indptr.tolist(), pattern.indices.tolist()).ldl()
+    indptr, indices = upper.get_ccs()
+    return np.array(order, dtype=np.int64), csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n)).tocsr()
+
+
+def _parents(lower: Any) -> Ints:
+    """(n,) the first row of each column, -1 if there is none."""
+    first = np.append(lower.indices, -1)[lower.indptr[:-1]]
+    return np.where(np.diff(lower.indptr) > 0, first, -1).astype(np.int64)
 
 
 def _runs(first: Ints, length: Ints) -> Ints:

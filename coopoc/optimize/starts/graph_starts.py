@@ -9,7 +9,7 @@ from ...errors import InputError
 from ...formats.graph import Graph
 from ..algebra.cholesky import cholesky_of, columns_solved
 from ..algebra.sparse import sparse
-from ..descent.levenberg_marquardt import GROWTH, arrive
+from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked
 from ..model.problem import Problem
 from ..model.space import Space, carried, exp, log
@@ -36,12 +36,8 @@ STAGE_STEPS = 5
 """Of each stage."""
 STAGE_TOLERANCE = 1e-2
 """m or rad, a step at which a stage has arrived for the purpose."""
-TRILATERATION_STEPS = 60
-"""Steps of a trilateration, of which ten are usual."""
-PLACED = 1e-6
-"""Share of the longest range: a shorter step is its last."""
-FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
-"""Damping at first, beside directions of length 1, and at least."""
+COINCIDENT = 1e-9
+"""m, a gap below which has no direction."""
 HOLDING = 2
 """Ranges per dimension from which a point is placed by them."""
 
@@ -122,6 +118,8 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
     >>> trilaterate(np.array([[0.0, 0], [8, 0], [4, 1]]), np.array([5.0, 5, 2])).round(6)
     array([4., 3.])
     """
+    from scipy.optimize import least_squares
+
     d, middle = places.shape[1], places.mean(axis=0)
     p = places - middle
     if len(p) <= d:
@@ -131,26 +129,17 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
     normal = np.linalg.eigh(p.T @ p)[1][:, 0]
     flat = guess - normal * (guess @ normal)
     height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
-    at, damping = np.array([guess, flat + height * normal, flat - height * normal]), np.full((3, 1, 1), FIRST_DAMPING)
-    now = _squares(p, ranges, at)
-    for _ in range(TRILATERATION_STEPS):
-        step = -np.linalg.solve(now[:, :d, :d] + damping * np.eye(d), now[:, :d, d:])[..., 0]
-        there = _squares(p, ranges, at + step)
-        better = there[:, d, d] < now[:, d, d]
-        at[better], now[better] = at[better] + step[better], there[better]
-        damping = np.where(better[:, None, None], np.maximum(damping / GROWTH, MIN_DAMPING), GROWTH * damping)
-        if np.abs(step).max() <= PLACED * ranges.max():
-            break
-    return np.asarray(at[np.argmin(now[:, d, d])] + middle)
 
+    def off(at: Floats) -> Floats:
+        return np.asarray(np.linalg.norm(at - p, axis=1) - ranges)
 
-def _squares(places: Floats, ranges: Floats, at: Floats) -> Floats:
-    """(G, d + 1, d + 1) [u e]^T [u e] at G points: the directions u (K, d) from the places and the errors e (K, 1) of
-    the ranges, so that the last number is the cost."""
-    gap = at[:, None] - places
-    distance = np.linalg.norm(gap, axis=2, keepdims=True)
-    rows = np.concatenate([gap / np.maximum(distance, MIN_DAMPING), distance - ranges[:, None]], axis=2)
-    return np.asarray(rows.swapaxes(1, 2) @ rows)
+    def directions(at: Floats) -> Floats:
+        gap = at - p
+        return np.asarray(gap / np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), COINCIDENT))
+
+    guesses = guess, flat + height * normal, flat - height * normal
+    ends = [least_squares(off, at, directions, method="lm") for at in guesses]
+    return np.asarray(min(ends, key=lambda end: end.cost).x + middle)
 
 
 def chained(graph: Graph) -> Floats:
