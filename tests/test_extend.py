@@ -111,7 +111,7 @@ def test_a_backend_is_checked_as_all_are(folder, monkeypatch):
     with refused(r"rounds = 3: is no option of least-squares"):
         solve(problem, "least_squares.py:BACKEND", rounds=3)
     with refused(r"is a function, no Backend"):
-        solve(problem, "least_squares.py:prepare")
+        solve(problem, "least_squares.py:solver")
 
 
 def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(folder, monkeypatch):
@@ -132,7 +132,7 @@ def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(folder, mon
         dz = np.diff(solve(problem.add("lidar.py:elevation", ("ego", "b"), 0.2, std=0.01)).x, axis=0)[0, 2]
         assert dz < 0  # both rows have the formula of the edited file
         with refused(r"is no measurement.*@measurement"):
-            problem.add("least_squares.py:prepare", ("ego", "b"), 0.2, std=0.01)
+            problem.add("least_squares.py:solver", ("ego", "b"), 0.2, std=0.01)
     finally:
         MEASUREMENTS.pop("elevation", None)
     with refused("Did you mean spherical"):

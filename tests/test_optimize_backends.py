@@ -111,7 +111,7 @@ def test_a_linear_problem_equals_lstsq(points, backend):
 
 def test_a_solution_is_verified_independently_of_the_solver(dense):
     """A backend that returns its start and claims one iteration is found out."""
-    overconfident = Backend("overconfident", lambda structure: lambda problem, x: SolverResult(x + 0.1, 1))
+    overconfident = Backend("overconfident", lambda problem, x: SolverResult(x + 0.1, 1))
     solution = solve(Problem.from_snapshot(dense, 10, 0), overconfident, throw=False)
     assert solution.status is Status.FAILED
     assert solution.gradient_norm > 0.01

@@ -386,7 +386,7 @@ def test_more_equalities_than_numbers_are_refused_by_casadi():
 def test_a_claim_is_verified_independently_of_the_solver(claim, status):
     claims = Backend(
         "claims",
-        lambda structure: lambda problem, x: SolverResult(np.array(claim, dtype=float), 1),
+        lambda problem, x: SolverResult(np.array(claim, dtype=float), 1),
         capabilities=Capabilities(constraints="linear"),
     )
     problem = PAIR.constrain("position", "a", upper=[5, INF, INF])

@@ -36,11 +36,6 @@ class SolverResult:
     extras: dict[str, Any] = field(default_factory=dict)
 
 
-Solver: TypeAlias = Callable[[Problem, Floats], SolverResult]
-"""(problem, start (n, ambient)) -> result. The problem has the structure for which the solver was prepared, with
-numbers of its own."""
-
-
 @dataclass(frozen=True)
 class Capabilities:
     """Which problems a backend can solve, as data: `solve` and its errors read it.
@@ -78,19 +73,17 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Backend:
-    """A solver by name, what it is for and what it can solve.
+    """A solver by name, and what it can solve.
 
     Args:
         name: as in `solve(problem, name)`.
-        prepare: `prepare(problem, **options)` returns the Solver of the problem's structure; it reads no numbers.
-        purpose: one line for lists.
+        solver: `solver(problem, start (n, ambient), **options)` returns its result.
         library: that it imports, None if it needs none but those of coopoc.
         capabilities: which problems it can solve.
     """
 
     name: str
-    prepare: Callable[..., Solver]
-    purpose: str = ""
+    solver: Callable[..., SolverResult]
     library: str | None = None
     capabilities: Capabilities = Capabilities()
 
@@ -99,14 +92,10 @@ class Backend:
         """True if its library is there."""
         return self.library is None or find_spec(self.library) is not None
 
-    def solver(self, problem: Problem, options: Options) -> Solver:
-        """The solver of a problem.
-
-        Raises:
-            InputError: an unknown option, or a problem beyond the capabilities; it names the backends that can.
-        """
+    def check(self, problem: Problem, options: Options) -> None:
+        """InputError for an unknown option, or a problem beyond the capabilities; it names the backends that can."""
         for name in options:
-            allowed = list(inspect.signature(self.prepare).parameters)[1:]
+            allowed = list(inspect.signature(self.solver).parameters)[2:]
             if name not in allowed:
                 hint = suggestion(name, allowed, "Leave it out.")
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
@@ -117,9 +106,10 @@ class Backend:
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"
             raise InputError("problem", f"with {', '.join(lacking)}", allowed_, "Name one that can, or change it.")
-        if not problem.movable.any():
-            return lambda part, x: SolverResult(x, 0)
-        return self.prepare(problem, **options)
+
+    def run(self, problem: Problem, start: Floats, options: Options) -> SolverResult:
+        """The solver's result; the start where nothing can move."""
+        return self.solver(problem, start, **options) if problem.movable.any() else SolverResult(start, 0)
 
 
 def backends() -> dict[str, Backend]:
@@ -152,6 +142,6 @@ def _registered(name: str) -> Backend:
     """The backend of a name; kept, since reading the entry points takes longer than a small solve."""
     backend = find("coopoc.backends", name)
     if not isinstance(backend, Backend):
-        hint = "Give coopoc.Backend(name, prepare, purpose)."
+        hint = "Give coopoc.Backend(name, solver)."
         raise InputError("backend", repr(name), f"is a {type(backend).__name__}, no Backend", hint)
     return backend

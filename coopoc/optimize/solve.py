@@ -13,7 +13,7 @@ from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES
 from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
-from .backend import MAX_ITERATIONS, Backend, Options, Solver, SolverResult, require_backend
+from .backend import MAX_ITERATIONS, Backend, Options, SolverResult, require_backend
 from .graph_problems import started
 from .model.factor import fused
 from .model.measurements import CONVERTED
@@ -97,7 +97,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     """The result of a backend, and its assessment."""
     load(*LIBRARIES)
     began, earlier = clock(), problem.search.seconds
-    solver, problem = backend.solver(problem, options), started(problem)
+    backend.check(problem, options)
+    problem = started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
     constraints, searching = problem.constraints, problem.x0 is None and not whole
@@ -109,9 +110,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem = robust_start(problem, start if problem.x0 is None else problem.x0)
     start = start if problem.x0 is None else problem.x0
     problem = problem.replace_unchecked(constraints=constraints)
-    result = solver(problem, start)
+    result = backend.run(problem, start, options)
     if searching and constraints:
-        problem, result = _drawn(problem, solver, result)
+        problem, result = _drawn(problem, backend, options, result)
     search = problem.search
     solved = clock()
     x, iterations, infeasible = result.x, result.iterations, result.infeasible
@@ -153,7 +154,7 @@ def _searched(problem: Problem, start: Floats) -> Problem:
 
     def relaxed(at: Problem) -> tuple[Floats, int]:
         with suppress(InputError, MissingLibraryError):  # too large, or no such relaxation
-            return require_backend("cvxpy").solver(at, {"refine": False})(at, start).x, 0
+            return require_backend("cvxpy").solver(at, start, refine=False).x, 0
         return start, 0
 
     starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
@@ -162,10 +163,10 @@ def _searched(problem: Problem, start: Floats) -> Problem:
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
-def _drawn(problem: Problem, solver: Solver, first: SolverResult) -> tuple[Problem, SolverResult]:
+def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverResult) -> tuple[Problem, SolverResult]:
     """The lowest feasible result of a problem with constraints, of the first and those from random places around it;
     the problem's notes are of the minima that were found."""
-    results = [first, *(solver(problem, y) for y in islice(scattered(problem, first.x), QUIET_DRAWS))]
+    results = [first, *(backend.run(problem, y, options) for y in islice(scattered(problem, first.x), QUIET_DRAWS))]
     beyond = [max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE) for each in results]
     costs = [problem.cost(each.x) for each in results]
     best = min(range(len(results)), key=lambda k: (beyond[k], costs[k]))

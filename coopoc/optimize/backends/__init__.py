@@ -1,1 +1,1 @@
-"""One file per solver; each has a BACKEND whose `prepare(structure, **options)` returns a solver."""
+"""One file per solver; each has a BACKEND with its `solver(problem, x, **options)`."""

@@ -15,7 +15,7 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, SolverResult
 from ..model.derivatives import Structure, expressions
 from ..model.factor import stacked, steerable
 from ..model.problem import Problem
@@ -45,11 +45,14 @@ IPOPT = {
 FATROP: dict[str, Any] = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "acceptable_iter": 3}
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
-    """Solver of a structure.
+def solver(
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+) -> SolverResult:
+    """Solve a problem from x (n, ambient).
 
     Args:
-        structure: a problem whose structure counts, and which of its constraints are equalities.
+        problem: that is solved.
+        x: start.
         max_iterations: of the method's own.
         tolerance: m or rad, step of a pose below which its chart is kept.
 
@@ -61,7 +64,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     >>> solve(problem.constrain("range", ("a", "b"), upper=7.0), "casadi").x.round(3)[:, 0]
     array([1., 8.])
     """
-    form, sides = structure_of(structure), _sides(structure)
+    form, sides = structure_of(problem), _sides(problem)
     equal, moving = int((sides[0] == sides[1]).sum()), int(form.movable.sum())
     if equal > moving:
         raise InputError(
@@ -71,19 +74,11 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             "Leave out those that follow from the others.",
         )
     methods = ("fatrop", "ipopt") if moving <= FATROP_NUMBERS and np.array_equal(*sides) else ("ipopt",)
-
-    @lru_cache
-    def nlp(method: str) -> NlpSolver:
-        return NlpSolver(programme(form, method, int(max_iterations)))
-
-    def solver(problem: Problem, x: Floats) -> SolverResult:
-        for method in methods:
-            end = _run(form, nlp(method), problem, x, sides, tolerance)
-            if end.extras["return_status"] == SUCCESS:
-                break
-        return replace(end, extras=end.extras | {"method": method})
-
-    return solver
+    for method in methods:
+        end = _run(form, NlpSolver(programme(form, method, int(max_iterations))), problem, x, sides, tolerance)
+        if end.extras["return_status"] == SUCCESS:
+            break
+    return replace(end, extras=end.extras | {"method": method})
 
 
 def _run(
@@ -190,8 +185,7 @@ def programme(structure: Structure, method: str, max_iterations: int) -> Any:
 
 BACKEND = Backend(
     "casadi",
-    prepare,
-    "nonlinear programming by FATROP or IPOPT, any constraints",
+    solver,
     "casadi",
     Capabilities(losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
 )

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, SolverResult
 from ..model.derivatives import linearise
 from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
@@ -38,36 +38,35 @@ ESTIMATORS = {
 """GTSAM's names of our losses; their values and weights are the same."""
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
-    """Solver of a structure.
+def solver(
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+) -> SolverResult:
+    """Solve a problem from x (n, ambient).
 
     Args:
-        structure: a problem whose structure counts.
+        problem: that is solved.
+        x: start.
         max_iterations: of GTSAM's linear solves that lowered the cost.
         tolerance: m or rad, which GTSAM, that stops by the cost, does not know.
     """
+    import gtsam
 
-    def solver(problem: Problem, x: Floats) -> SolverResult:
-        import gtsam
-
-        posed, parts = which_turn(problem), forms(problem)
-        graph, used, custom = graph_of(problem, parts), 0, parts.count(None)
-        for _ in range(1 if problem.linear else STARTS):
-            params = gtsam.LevenbergMarquardtParams()
-            params.setMaxIterations(max_iterations - used)
-            params.setRelativeErrorTol(PRECISE)
-            params.setAbsoluteErrorTol(0.0)
-            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x), params)
-            try:
-                x = estimate(problem.space, posed, optimizer.optimize())
-            except RuntimeError:  # a singular system: `solve` names the nodes that are free
-                break
-            used += optimizer.iterations()
-            if used >= max_iterations or optimizer.lambda_() <= params.getlambdaInitial():
-                break
-        return SolverResult(x, used, extras={"custom_factors": custom})
-
-    return solver
+    posed, parts = which_turn(problem), forms(problem)
+    graph, used, custom = graph_of(problem, parts), 0, parts.count(None)
+    for _ in range(1 if problem.linear else STARTS):
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(max_iterations - used)
+        params.setRelativeErrorTol(PRECISE)
+        params.setAbsoluteErrorTol(0.0)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x), params)
+        try:
+            x = estimate(problem.space, posed, optimizer.optimize())
+        except RuntimeError:  # a singular system: `solve` names the nodes that are free
+            break
+        used += optimizer.iterations()
+        if used >= max_iterations or optimizer.lambda_() <= params.getlambdaInitial():
+            break
+    return SolverResult(x, used, extras={"custom_factors": custom})
 
 
 class Part(NamedTuple):
@@ -350,7 +349,6 @@ def _robust(model: Any, loss: Loss | None) -> Any:
 
 BACKEND = Backend(
     "gtsam",
-    prepare,
-    "a second opinion: GTSAM's own Levenberg-Marquardt, factors and robust noise models",
+    solver,
     "gtsam",
 )

@@ -20,7 +20,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, Solver, SolverResult
+from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
@@ -61,11 +61,14 @@ STEP_WEIGHT = 1e-6
 """Cost of a step of 1 m over that of a violation of 1 m, where none can be avoided."""
 
 
-def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE) -> Solver:
-    """Solver of a structure. A linear problem is a single quadratic programme.
+def solver(
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+) -> SolverResult:
+    """Solve a problem from x (n, ambient). A linear problem is a single quadratic programme.
 
     Args:
-        structure: a problem whose structure counts, and its constraints.
+        problem: that is solved.
+        x: start.
         max_iterations: of quadratic programmes.
         tolerance: m, largest move of a point in the last step.
 
@@ -74,38 +77,26 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     >>> solve(problem.constrain("displacement", ("a", "b"), upper=[7, 9, 9]), "osqp").x.round(3)[:, 0]
     array([1., 8.])
     """
-    held, layout = None, layout_of(structure)
-    if structure.constraints:
-        from scipy.sparse import csc_matrix
+    system, layout, held = sparse(problem), layout_of(problem), bool(problem.constraints)
+    programme = _bounded(problem, layout) if held else unbounded(layout, get_ident())
+    programme.counts.update(osqp_iterations=0, repairs=0)
+    if held:
+        try:
+            x, feasible = _nearest(problem, x)
+        except np.linalg.LinAlgError:
+            return SolverResult(x, 0, extras=dict(programme.counts))
+        if not feasible:
+            return SolverResult(x, 0, True, dict(programme.counts))
 
-        rows = constraint_rows(structure, np.zeros((len(structure.names), structure.space.ambient)))
-        held = Programme(_pattern(layout), csc_matrix(rows.matrix)[:, layout.entries.number.ravel() >= 0])
+    def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
+        sides = constraint_rows(problem, x).sides if held else (np.empty(0), np.empty(0))
+        try:
+            return programme.solve(values, gradient, *sides) if system.cholesky.factor(values) else None
+        except np.linalg.LinAlgError:
+            return None
 
-    def solver(problem: Problem, start: Floats) -> SolverResult:
-        system, x = sparse(problem), start
-        programme = held or unbounded(layout, get_ident())
-        programme.counts.update(osqp_iterations=0, repairs=0)
-        if held:
-            try:
-                x, feasible = _nearest(structure, start)
-            except np.linalg.LinAlgError:
-                return SolverResult(x, 0, extras=dict(programme.counts))
-            if not feasible:
-                return SolverResult(x, 0, True, dict(programme.counts))
-
-        def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
-            sides = constraint_rows(structure, x).sides if held else (np.empty(0), np.empty(0))
-            try:
-                return programme.solve(values, gradient, *sides) if system.cholesky.factor(values) else None
-            except np.linalg.LinAlgError:
-                return None
-
-        end = arrive(
-            system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, bool(held)
-        )
-        return SolverResult(end.x, end.iterations, extras=dict(programme.counts))
-
-    return solver
+    end = arrive(system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, held)
+    return SolverResult(end.x, end.iterations, extras=dict(programme.counts))
 
 
 def _pattern(layout: Layout) -> Any:
@@ -190,6 +181,14 @@ class Programme:
         return bool(np.all(kept & pushed))
 
 
+def _bounded(problem: Problem, layout: Layout) -> Programme:
+    """The programme of a problem with its constraints, which are linear."""
+    from scipy.sparse import csc_matrix
+
+    rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
+    return Programme(_pattern(layout), csc_matrix(rows.matrix)[:, layout.entries.number.ravel() >= 0])
+
+
 @lru_cache(maxsize=64)
 def unbounded(layout: Layout, thread: int) -> Programme:
     """The programme without bounds of a structure, its workspace set up once, its own for each thread."""
@@ -221,8 +220,7 @@ def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
 
 BACKEND = Backend(
     "osqp",
-    prepare,
-    "sequential quadratic programming, persistent workspace",
+    solver,
     "osqp",
     Capabilities(constraints="linear"),
 )
