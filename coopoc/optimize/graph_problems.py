@@ -39,8 +39,6 @@ MEASUREMENT_KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
-PLACES = 3
-"""Of a body among what it ranges, that are tried: mirror images of a nearly straight drive fit nearly as well."""
 Start = Literal["odometry", "file", "tree", "linear", "incremental", "auto"]
 
 
@@ -139,11 +137,9 @@ def started(problem: Problem) -> Problem:
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
-        own = {name: _x0(graph, problem.poses, name) for name in contenders(graph)}
-        starts = {name: partial(placed, problem, x) for name, x in own.items()}
-        for k in range(1, PLACES if len(graph.ranges) else 1):
-            starts[f"odometry, place {k + 1}"] = partial(placed, problem, own["odometry"], k)
-        at = problem.replace_unchecked(x0=frozen(starts["odometry"]()))
+        starts = {name: partial(placed, problem, _x0(graph, problem.poses, name)) for name in contenders(graph)}
+        first = starts["odometry"]()
+        at, starts["odometry"] = problem.replace_unchecked(x0=frozen(first)), lambda: first
         at, won = _raced(graph, at, starts, lambda x: False, None if places_all(problem) else True)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 

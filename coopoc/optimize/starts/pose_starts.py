@@ -5,17 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Bools, Floats, Ints
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
-from ...world.links import wrap
-from ..model.factor import Factor, fused, stacked, taken
+from ..model.derivatives import linearise
+from ..model.factor import Factor, fused, stacked, taken, unchecked
 from ..model.measurements import CONVERTED
 from ..model.problem import Problem
-from ..model.space import Space, exp
+from ..model.space import exp
 from .graph_starts import parts, trilaterate, walk, with_points
 from .initial import as_vectors, by_vectors, directed, initial_guess
-from .mirrors import ranges_of
+from .mirrors import RANGES, ranges_of
 
 FIELDS = {
     "pose": "pose_prior",
@@ -34,8 +34,8 @@ FIRST_STEPS, LAST_STEPS = 10, 100
 """Steps from each turn of a body, and from the best of these."""
 MAX_STD = 1e100
 """Standard deviations, whose square is a number."""
-PLACES_APART = 0.1
-"""Share of the size of a body by which places of it differ."""
+FIXES = "position", "antenna"
+"""Kinds whose z is where their first node is, or nearly."""
 PLACING = {*FIELDS, "bearing", "displacement", CONVERTED}
 """Kinds by which a start places nodes; where there are others, nodes are drawn, too."""
 LEVER = 1e-2
@@ -107,116 +107,89 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
     return z, variance[:, :, None] * np.eye(variance.shape[1])
 
 
-def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
-    """Nodes x (n, ambient) with each body, which relative measurements hold together, turned and moved to where its
-    fixes, and vectors, ranges and bearings between it and what is placed, fit best: those with most fixes first, then
-    most ranges. The fix of an antenna is one of its pose, and a vector from what is placed is a fix.
+def placed(problem: Problem, x: Floats) -> Floats:
+    """Nodes x (n, ambient) with each body, which relative measurements hold together, turned and moved to where all
+    that is measured between it and the world, or what is placed, fits best: the one with most such numbers first.
+    Points go to their fixes, and where vectors and ranges put them.
 
     A body with a measured pose stays, and so does the first where nothing is placed. At last points go where bearings
-    from poses cross. Of the places that ranges allow that of `rank` is taken, 0 the best.
+    from poses cross.
     """
-    d, space, x = problem.dimension, problem.space, x.copy()
-    joined = [f.nodes[f.informative] for f in problem.factors if _field(f).startswith("relative")]
-    part, ranges = parts(len(x), *joined), ranges_of(problem, x)
-    fixes, vectors = (
-        [taken(f, np.flatnonzero(f.informative)) for f in problem.factors if f.kind in kinds]
-        for kinds in (("position", "antenna"), ("displacement", CONVERTED))
-    )
-    vectors = [as_vectors(f) if f.kind == CONVERTED else f for f in vectors]
-    ends, vector = stacked((f.nodes for f in vectors), 2), stacked((f.z for f in vectors), d)
-    own_fixed, own_fix = stacked(f.nodes[:, 0] for f in fixes), stacked((f.z for f in fixes), d)
-    own_weight, vector_weight = (
-        stacked(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in factors) for factors in (fixes, vectors)
-    )
-    held = [part[f.nodes[:, 0]] for f in problem.factors if f.kind.startswith("pose")]
-    known, single = np.isin(part, np.concatenate([[-1], *held])), np.bincount(part)[part] == 1
-    aims = [f for f in problem.factors if f.kind == "bearing"]
-    aimed = stacked((f.nodes for f in aims), 2)
-    angle, sure = stacked(f.z[:, 0] for f in aims), stacked(f.root[:, 0, 0] for f in aims)
-    here = (single & ~known)[own_fixed]
-    x[own_fixed[here], :d], known[own_fixed[here]] = own_fix[here], True
+    d, n, x = problem.dimension, len(x), x.copy()
+    bare = [unchecked(taken(f, np.flatnonzero(f.informative)), loss=None) for f in problem.factors]
+    factors, ranges = [as_vectors(f) if f.kind == CONVERTED else f for f in bare], ranges_of(problem, x)
+    part = parts(n, *(f.nodes for f in factors if _field(f).startswith("relative")))
+    single, vectors = np.bincount(part)[part] == 1, [f for f in factors if f.kind == "displacement"]
+    stays = [part[f.nodes[:, 0]] for f in factors if f.kind.startswith("pose")]
+    placing = stacked(f.nodes[:, :2].ravel() for f in factors if f.kind in RANGES or _plain(f) in PLACING)
+    known = np.isin(part, stacked(stays)) | (single & ~np.isin(np.arange(n), placing))  # such as an antenna's arm
+    for f in factors:
+        if f.kind in FIXES:
+            own = np.flatnonzero(single[f.nodes[:, 0]])
+            x[f.nodes[own, 0], :d], known[f.nodes[own, 0]] = f.z[own], True
     while not known.all():
-        k, side = np.nonzero(known[ends[:, ::-1]] & ~known[ends])
-        fixed = np.concatenate([own_fixed, ends[k, side]])
-        fix = np.concatenate([own_fix, x[ends[k, 1 - side], :d] + np.where(side[:, None], 1.0, -1.0) * vector[k]])
-        weight = np.concatenate([own_weight, vector_weight[k]])
-        k, side = np.nonzero(known[ranges.nodes[:, ::-1]] & ~known[ranges.nodes] & (ranges.weight > 0)[:, None])
-        own, places = ranges.nodes[k, side], ranges.nodes[k, 1 - side]
-        seen = np.bincount(part[own], minlength=len(x))[part]
-        best = np.lexsort([~single, seen, np.bincount(part[fixed], minlength=len(x))[part], ~known])[-1]
-        moving, here = np.flatnonzero(part == part[best]), part[fixed] == part[best]
-        there = (part[aimed[:, 0]] == part[best]) & known[aimed[:, 1]]
-        if single[best] and here.any():
-            linked = parts(len(x), ends[(single | known)[ends].all(axis=1)])
+        numbers, aligning = np.zeros(n), [_aligning(f, part, known) for f in factors]
+        for f, (_, body) in zip(factors, aligning, strict=True):
+            if f.measurement.components[0] != "angle":
+                numbers += f.size * np.bincount(body, minlength=n)
+        best = np.lexsort([~single, numbers[part], ~known])[-1]
+        moving = np.flatnonzero(part == part[best])
+        own_factors = [taken(f, rows[body == part[best]]) for f, (rows, body) in zip(factors, aligning, strict=True)]
+        if not single[best] and any(len(f.nodes) for f in own_factors):
+            x[moving] = _fitted(problem, x, moving, own_factors)
+        elif any(len(f.nodes) for f in own_factors if f.kind == "displacement"):
+            linked = parts(n, *(f.nodes[(single | known)[f.nodes].all(axis=1)] for f in vectors))
             moving = np.flatnonzero(single & ~known & np.isin(linked, linked[known]))
-            x = by_vectors(problem, x, np.setdiff1d(np.arange(len(x)), moving), vectors)
+            x = by_vectors(problem, x, np.setdiff1d(np.arange(n), moving), vectors)
         elif single[best]:
+            edge = np.flatnonzero((known[ranges.nodes].sum(axis=1) == 1) & (ranges.weight > 0))
+            ranged = np.where(known[ranges.nodes[edge, 0]], *ranges.nodes[edge, ::-1].T)
+            others, seen = ranges.nodes[edge].sum(axis=1) - ranged, np.bincount(ranged, minlength=n)
             moving = np.flatnonzero(single & ~known & (seen >= min(seen[best], d + 1)))
             for node in moving[seen[moving] > 0].tolist():
-                x[node, :d] = trilaterate(x[places[own == node], :d], ranges.distance[k[own == node]])
-        elif here.any() or seen[best] or there.any():
-            rows = part[own] == part[best]
-            distances = x[own[rows], :d], x[places[rows], :d], ranges.distance[k[rows]], ranges.weight[k[rows]]
-            bearings = x[aimed[there, 0]], x[aimed[there, 1], :d], angle[there], sure[there]
-            own_fixes = x[fixed[here], :d], fix[here], weight[here]
-            x[moving] = _fitted(space, x[moving], own_fixes, distances, bearings, rank)
+                x[node, :d] = trilaterate(x[others[ranged == node], :d], ranges.distance[edge[ranged == node]])
         known[moving] = True
     return directed(problem, _crossed(problem, x))
 
 
-def _fitted(
-    space: Space,
-    body: Floats,
-    fixes: tuple[Floats, ...],
-    ranges: tuple[Floats, ...],
-    bearings: tuple[Floats, ...],
-    rank: int,
-) -> Floats:
-    """Nodes of a body (K, ambient) where it fits best, from turns that are spread over all.
+def _aligning(factor: Factor, part: Ints, known: Bools) -> tuple[Ints, Ints]:
+    """Rows of a factor that measure one body against the world or what is known, and its number in `part`."""
+    new, own = ~known[factor.nodes], part[factor.nodes]
+    body = own.max(axis=1, where=new, initial=-1)
+    against = (own.shape[1] == 1) | ~new.all(axis=1)
+    rows = np.flatnonzero(new.any(axis=1) & against & (~new | (own == body[:, None])).all(axis=1))
+    return rows, body[rows]
 
-    Args:
-        space: of the nodes.
-        body: its nodes.
-        fixes: where they are on it (F, d), their fixes (F, d) and 1/m.
-        ranges: where they are on it (M, d), the places (M, d) to which they have ranges, these (M,) and 1/m.
-        bearings: poses of it (B, ambient), the places (B, d) of which they have bearings, these (B,) and 1/rad.
-    """
+
+def _fitted(problem: Problem, x: Floats, body: Ints, factors: list[Factor]) -> Floats:
+    """Nodes of a body (K, ambient) moved from where they are in x (n, ambient), as a rigid body, to where factors
+    without loss fit best, from turns that are spread over all."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    d = space.dimension
-    seen, fix, precise = (part[:: len(part) // ROWS_USED + 1] for part in fixes)
-    near, places, distance, weight = (part[:: len(part) // ROWS_USED + 1] for part in ranges)
-    poses, marks, angle, sure = (part[:: len(part) // ROWS_USED + 1] for part in bearings)
-    middle, to = space.position(body).mean(axis=0), np.concatenate([fix, places, marks]).mean(axis=0)
+    space, d = problem.space, problem.dimension
+    factors = [taken(f, np.arange(0, len(f.nodes), len(f.nodes) // ROWS_USED + 1)) for f in factors if len(f.nodes)]
+    ends = ((f, f.nodes[:, :2][~np.isin(f.nodes[:, :2], body)]) for f in factors)
+    to = np.concatenate([f.z[:, :d] if f.kind in FIXES else x[outside, :d] for f, outside in ends]).mean(axis=0)
+    at, rotation = space.position(x[body]), space.rotation(x[body])
+    middle = at.mean(axis=0)
 
-    def moved(v: Floats, turn: Floats, at: Floats) -> Floats:
-        return np.asarray(to + v[:d] + (at - middle) @ (exp(v[d:]) @ turn).T)
+    def moved(v: Floats, turn: Floats) -> Floats:
+        turned, there = exp(v[d:]) @ turn, x.copy()
+        there[body] = space.join(to + v[:d] + (at - middle) @ turned.T, turned @ rotation)
+        return there
 
     def residuals(v: Floats, turn: Floats) -> Floats:
-        off = (moved(v, turn, seen) - fix) * precise[:, None]
-        length = np.linalg.norm(moved(v, turn, near) - places, axis=1)
-        gap = marks - moved(v, turn, space.position(poses))
-        east, north = np.einsum("mab,ma->bm", exp(v[d:]) @ turn @ space.rotation(poses), gap)[:2]
-        aside = wrap(np.arctan2(north, east) - angle)
-        every = np.concatenate([off.ravel(), (length - distance) * weight, aside * sure])
-        return np.asarray(np.clip(np.nan_to_num(every), -MAX_STD, MAX_STD))
+        white = linearise(space, factors, None, moved(v, turn)).residual
+        return np.asarray(np.clip(np.nan_to_num(np.concatenate([r.ravel() for r in white])), -MAX_STD, MAX_STD))
 
     def fitted(v: Floats, turn: Floats, steps: int) -> tuple[float, Floats, Floats]:
         end = least_squares(residuals, v, args=(turn,), max_nfev=steps)
         return float(end.cost), end.x, turn
 
     turns = exp(np.arange(8)[:, None] * np.pi / 4) if d == 2 else Rotation.create_group("O").as_matrix()
-    ends = sorted((fitted(np.zeros(space.dof), each, FIRST_STEPS) for each in turns), key=lambda end: end[0])
-    best, apart = list[Floats](), np.linalg.norm(space.position(body) - middle, axis=1).max()
-    for _, v, turn in ends:
-        _, v, turn = fitted(v, turn, LAST_STEPS)
-        there = space.join(moved(v, turn, space.position(body)), exp(v[d:]) @ turn @ space.rotation(body))
-        if all(np.abs(space.position(there - other)).max() > PLACES_APART * apart for other in best):
-            best.append(there)
-        if len(best) > rank:
-            break
-    return best[-1]
+    _, v, turn = min((fitted(np.zeros(space.dof), each, FIRST_STEPS) for each in turns), key=lambda end: end[0])
+    return moved(*fitted(v, turn, LAST_STEPS)[1:])[body]
 
 
 def _crossed(problem: Problem, x: Floats) -> Floats:
