@@ -1,7 +1,7 @@
 """Multi-start: a few steps of Levenberg-Marquardt from each start, and the lowest goes on."""
 
 from collections.abc import Callable, Iterator, Mapping
-from itertools import count
+from itertools import chain
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
-from ..model.factor import reweighed, taken
+from ..model.factor import reweighed
 from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
-from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
+from .mirrors import RANGES, Cost, Descend, across, regrown
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -96,7 +96,7 @@ def race(
         ends, least = list[tuple[float, Floats]](), system.cost(x)
         drawing = least > limit if draws is None else draws
         most = QUIET_DRAWS if least <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
-        for k, away in enumerate(scattered(problem, x) if drawing else ()):
+        for k, away in enumerate(scattered(problem, x, np.arange(len(x))) if drawing else ()):
             if k >= most:
                 break
             y = descend(away, LATER_STEPS[-1][1])
@@ -167,43 +167,28 @@ def race(
     return ended(name, x)
 
 
-def scattered(problem: Problem, x: Floats) -> Iterator[Floats]:
-    """Nodes x (n, ambient) moved at random as far as they are from one another: all points, across the plane or line
-    that they are nearest to, and one; or bodies, which relative measurements hold together and no pose is measured of,
-    all or one, every other time turned alone."""
-    if problem.poses:
-        yield from _turned(problem, x)
-        return
-    rng, (n, d), free = np.random.default_rng(0), x.shape, np.ones((len(x), 1))
-    free[list(problem.fixed)] = 0.0
-    around = x - x.mean(axis=0)
-    spread, (*_, thin) = np.sqrt(d * np.square(around).mean()), np.linalg.svd(around, full_matrices=False)[2]
-    for k in range(min(DRAWS, DRAWN_POINTS // n)):
-        away = spread * rng.normal(size=(n, d)) * free
-        if k % 4 == 1:
-            away[np.arange(n) != rng.integers(n)] = 0.0
-        elif k % 4 == 3:
-            away = np.outer(away @ thin, thin)
-        yield x + away
-
-
-def _turned(problem: Problem, x: Floats) -> Iterator[Floats]:
+def scattered(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
+    """Nodes x (n, ambient) with bodies, which relative measurements hold together and no pose is measured of, moved at
+    random as far as they are from one another: all that are `loose`, one, or all across the plane or line that they are
+    nearest to; at first turned alone. A point is a body, and goes anywhere among the others."""
     from scipy.spatial.transform import Rotation
 
     rng, space, n = np.random.default_rng(0), problem.space, len(x)
     d, at = space.dimension, space.position(x)
     center = np.median(at, axis=0)  # what has gone far away draws nothing there
     spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
+    normal = np.linalg.svd(at - at.mean(axis=0))[2][-1]
     part = parts(n, *(f.nodes[f.informative] for f in problem.factors if f.kind.startswith(("relative", "body"))))
     held = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
-    free = np.setdiff1d(part, part[np.concatenate([np.array(problem.fixed, np.int64), *held])])
+    free = np.setdiff1d(part[loose], part[np.concatenate([np.array(problem.fixed, np.int64), *held])])
     for k in range(min(DRAWS, DRAWN_POINTS // n) if len(free) else 0):
         y = x.copy()
-        for body in free if k % 4 < 2 else rng.choice(free, 1):
+        for body in rng.choice(free, 1) if k % 4 == 2 else free:
             own = np.flatnonzero(part == body)
             turn = exp(rng.uniform(-np.pi, np.pi, 1)) if d == 2 else Rotation.random(random_state=rng).as_matrix()
-            middle, to = at[own].mean(axis=0), center if len(own) == 1 else at[own].mean(axis=0)
-            to = to + spread * rng.normal(size=d) * (k % 2 or len(own) == 1)
+            middle, move, alone = at[own].mean(axis=0), spread * rng.normal(size=d), len(own) == 1
+            to = (center if alone else middle) + move * (k % 4 > 0 or alone)
+            to = middle + normal * (move @ normal) if k % 4 == 3 else to
             y[own] = space.join((at[own] - middle) @ turn.T + to, turn @ space.rotation(x[own]))
         yield y
 
@@ -250,7 +235,7 @@ def drawn(problem: Problem, x: Floats, loose: Ints, descend: Descend, cost: Cost
     """
     ends, most, d = list[tuple[float, Floats]](), min(DRAWN_POINTS // len(x), QUIET_DRAWS), problem.dimension
     best, least, agree = x, np.nan_to_num(cost(x), nan=np.inf), 0
-    for y in _places(problem, x, loose) if len(loose) else ():
+    for y in chain([x], scattered(problem, x, loose)) if len(loose) else ():
         y = descend(y) if ends else x
         now = np.nan_to_num(cost(y), nan=np.inf)
         while higher(now, after := cost(z := descend(regrown(problem, y)))):
@@ -276,26 +261,3 @@ def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
 def rival(more: float) -> str:
     """The note on a minimum that costs more."""
     return f"another minimum costs {more:.3g} more: noise may decide between them"
-
-
-def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
-    """x (n, ambient), and then without end the `loose` points anywhere among the others and the fixes, as known fixes
-    have them, and every other time where shortest paths along a part of the ranges put them."""
-    rng, d, fixes = np.random.default_rng(0), problem.dimension, [f for f in problem.factors if f.kind == "position"]
-    everywhere = np.concatenate([x[:, :d], *(f.z for f in fixes)])
-    yield x
-    for k in count(1):
-        y = x.copy()
-        y[loose, :d] = rng.uniform(everywhere.min(axis=0), everywhere.max(axis=0), (len(loose), d))
-        for f in fixes:
-            here = np.isin(f.nodes[:, 0], loose) & (f.loss is None)
-            noise = np.linalg.pinv(f.root[here]) @ rng.normal(size=(here.sum(), d, 1))
-            y[f.nodes[here, 0], :d] = f.z[here] + noise[..., 0]
-        if k % 2 and not problem.space.has_rotation:
-            part = (
-                taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PATH_SHARE)) if f.kind == "range" else f
-                for f in problem.factors
-            )
-            by_paths = scaled(problem.replace_unchecked(factors=tuple(part)), x)
-            y = y if by_paths is x else by_paths
-        yield y
