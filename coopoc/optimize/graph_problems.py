@@ -137,10 +137,13 @@ def started(problem: Problem) -> Problem:
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
-        starts = {name: partial(placed, problem, _x0(graph, problem.poses, name)) for name in contenders(graph)}
+        x0 = {name: _x0(graph, problem.poses, name) for name in contenders(graph)}
+        starts: dict[str, Callable[[], Floats]] = {name: partial(placed, problem, x) for name, x in x0.items()}
         first = starts["odometry"]()
-        at, starts["odometry"] = problem.replace_unchecked(x0=frozen(first)), lambda: first
-        at, won = _raced(graph, at, starts, lambda x: False, None if places_all(problem) else True)
+        at = problem.replace_unchecked(x0=frozen(first))
+        at, won = _raced(
+            graph, at, starts | {"odometry": lambda: first}, lambda x: False, None if places_all(problem) else True
+        )
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

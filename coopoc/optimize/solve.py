@@ -166,13 +166,8 @@ def _searched(problem: Problem, start: Floats) -> Problem:
 def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverResult) -> tuple[Problem, SolverResult]:
     """The lowest feasible result of a problem with constraints, of the first and those from random places around it;
     the problem's notes are of the minima that were found."""
-    results = [
-        first,
-        *(
-            backend.run(problem, y, options)
-            for y in islice(scattered(problem, first.x, np.arange(len(first.x))), QUIET_DRAWS)
-        ),
-    ]
+    starts = islice(scattered(problem, first.x), QUIET_DRAWS)
+    results = [first, *(backend.run(problem, y, options) for y in starts)]
     beyond = [max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE) for each in results]
     costs = [problem.cost(each.x) for each in results]
     best = min(range(len(results)), key=lambda k: (beyond[k], costs[k]))

@@ -96,7 +96,7 @@ def race(
         ends, least = list[tuple[float, Floats]](), system.cost(x)
         drawing = least > limit if draws is None else draws
         most = QUIET_DRAWS if least <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
-        for k, away in enumerate(scattered(problem, x, np.arange(len(x))) if drawing else ()):
+        for k, away in enumerate(scattered(problem, x) if drawing else ()):
             if k >= most:
                 break
             y = descend(away, LATER_STEPS[-1][1])
@@ -167,9 +167,9 @@ def race(
     return ended(name, x)
 
 
-def scattered(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
+def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterator[Floats]:
     """Nodes x (n, ambient) with bodies, which relative measurements hold together and no pose is measured of, moved at
-    random as far as they are from one another: all that are `loose`, one, or all across the plane or line that they are
+    random as far as they are from one another: all (or the `loose`), one, or all across the plane or line that they are
     nearest to; at first turned alone. A point is a body, and goes anywhere among the others."""
     from scipy.spatial.transform import Rotation
 
@@ -180,7 +180,9 @@ def scattered(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
     normal = np.linalg.svd(at - at.mean(axis=0))[2][-1]
     part = parts(n, *(f.nodes[f.informative] for f in problem.factors if f.kind.startswith(("relative", "body"))))
     held = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
-    free = np.setdiff1d(part[loose], part[np.concatenate([np.array(problem.fixed, np.int64), *held])])
+    free = np.setdiff1d(
+        part if loose is None else part[loose], part[np.concatenate([np.array(problem.fixed, np.int64), *held])]
+    )
     for k in range(min(DRAWS, DRAWN_POINTS // n) if len(free) else 0):
         y = x.copy()
         for body in rng.choice(free, 1) if k % 4 == 2 else free:
