@@ -9,11 +9,11 @@ from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
-from ..model.factor import reweighed
+from ..model.factor import reweighed, taken
 from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
-from .mirrors import RANGES, Cost, Descend, across, regrown
+from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -237,7 +237,7 @@ def drawn(problem: Problem, x: Floats, loose: Ints, descend: Descend, cost: Cost
     """
     ends, most, d = list[tuple[float, Floats]](), min(DRAWN_POINTS // len(x), QUIET_DRAWS), problem.dimension
     best, least, agree = x, np.nan_to_num(cost(x), nan=np.inf), 0
-    for y in chain([x], scattered(problem, x, loose)) if len(loose) else ():
+    for y in chain([x], _places(problem, x, loose)) if len(loose) else ():
         y = descend(y) if ends else x
         now = np.nan_to_num(cost(y), nan=np.inf)
         while higher(now, after := cost(z := descend(regrown(problem, y)))):
@@ -263,3 +263,16 @@ def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
 def rival(more: float) -> str:
     """The note on a minimum that costs more."""
     return f"another minimum costs {more:.3g} more: noise may decide between them"
+
+
+def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
+    """Nodes x (n, ambient) with the `loose` points `scattered`, and every other time where shortest paths along a part
+    of the ranges put them."""
+    rng = np.random.default_rng(0)
+    for k, y in enumerate(scattered(problem, x, loose)):
+        part = (
+            taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PATH_SHARE)) if f.kind == "range" else f
+            for f in problem.factors
+        )
+        paths = x if k % 2 or problem.poses else scaled(problem.replace_unchecked(factors=tuple(part)), x)
+        yield y if paths is x else paths
