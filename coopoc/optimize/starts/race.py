@@ -177,12 +177,11 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
     d, at = space.dimension, space.position(x)
     center = np.median(at, axis=0)  # what has gone far away draws nothing there
     spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
-    normal = np.linalg.svd(at - at.mean(axis=0))[2][-1]
+    normal = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][-1]
     part = parts(n, *(f.nodes[f.informative] for f in problem.factors if f.kind.startswith(("relative", "body"))))
-    held = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
-    free = np.setdiff1d(
-        part if loose is None else part[loose], part[np.concatenate([np.array(problem.fixed, np.int64), *held])]
-    )
+    poses = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
+    held = np.concatenate([np.array(problem.fixed, np.int64), *poses])
+    free = np.setdiff1d(part if loose is None else part[loose], part[held])
     for k in range(min(DRAWS, DRAWN_POINTS // n) if len(free) else 0):
         y = x.copy()
         for body in rng.choice(free, 1) if k % 4 == 2 else free:
