@@ -169,10 +169,11 @@ def _fitted(problem: Problem, x: Floats, body: Ints, factors: list[Factor]) -> F
 
     space, d = problem.space, problem.dimension
     factors = [taken(f, np.arange(0, len(f.nodes), len(f.nodes) // ROWS_USED + 1)) for f in factors if len(f.nodes)]
-    ends = ((f, f.nodes[:, :2][~np.isin(f.nodes[:, :2], body)]) for f in factors)
-    to = np.concatenate([f.z[:, :d] if f.kind in FIXES else x[outside, :d] for f, outside in ends]).mean(axis=0)
     at, rotation = space.position(x[body]), space.rotation(x[body])
+    ends = ((f, f.nodes[:, :2][~np.isin(f.nodes[:, :2], body)]) for f in factors)
+    known = np.concatenate([f.z[:, :d] if f.kind in FIXES else x[outside, :d] for f, outside in ends])
     middle = at.mean(axis=0)
+    to = known.mean(axis=0) if len(known) else middle
 
     def moved(v: Floats, turn: Floats) -> Floats:
         turned, there = exp(v[d:]) @ turn, x.copy()
