@@ -71,8 +71,7 @@ class Problem:
         factors: the measurements.
         x0: (n, ambient) where the solver starts. None: the converted measurements' linear solution, or what `solve`
             finds.
-        separator: nodes that the others hang on, such as the ego at each step. What remains without them must fall into
-            small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
+        separator: nodes that the others hang on, such as the ego at each step; a Solution shows the last of them.
         dimension: 2 or 3.
         poses: the nodes that have a rotation.
         fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
