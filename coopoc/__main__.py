@@ -25,7 +25,7 @@ def main() -> None:
         pass
     threading._shutdown()  # type: ignore[attr-defined]  # as Python does first: a thread that waits there ends the workers
     atexit._run_exitfuncs()
-    with suppress(OSError):
+    with suppress(OSError, AttributeError):
         sys.stdout.flush()
         sys.stderr.flush()
     os._exit(status if isinstance(status, int) else bool(status))

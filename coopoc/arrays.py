@@ -108,7 +108,7 @@ def plain(values: object) -> AnyArray:
 
 
 def listed(field: str, values: Any, hint: str, allowed: str = "must be a sequence") -> list[Any]:
-    """Entries of a sequence; InputError for one text, and for what has no entries.
+    """Entries of a sequence; InputError for one text, for what has no entries, or has them once only (a generator).
 
     >>> listed("egos", np.array(3), "Give [3].")
     Traceback (most recent call last):
@@ -116,7 +116,8 @@ def listed(field: str, values: Any, hint: str, allowed: str = "must be a sequenc
     """
     if not isinstance(values, str | bytes) and not np.ma.is_masked(values):
         try:
-            return list(values)
+            if (entries := iter(values)) is not values:
+                return list(entries)
         except Exception:  # a class from elsewhere may raise anything
             pass
     raise InputError(field, shown(values), allowed, hint)

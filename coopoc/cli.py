@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import sys
 import textwrap
 import warnings
@@ -93,7 +94,7 @@ def run(
     if tracks == "tum":
         print(f"coopoc: estimates are in {write_tracks(name, out, changes)}", file=sys.stderr)
     failed = f"; cells failed: {results.failed}, try them again with --retry-failed" if results.failed else ""
-    print(f"coopoc: results are in {folder}{failed}. Report: coopoc report {folder}", file=sys.stderr)
+    print(f"coopoc: results are in {folder}{failed}. Report: coopoc report {shlex.quote(str(folder))}", file=sys.stderr)
     return int(results.failed > 0)
 
 
@@ -148,9 +149,7 @@ def report(
     """
     from .study.report import report as write_report
 
-    if not folders:
-        raise InputError("folders", "none", "must be at least one", "Example: coopoc report runs/neighbours.")
-    print(write_report(folders, out or folders[0] / "report.html", title))
+    print(write_report(folders, out or Path(*folders[:1], "report.html"), title))
 
 
 def list_names() -> None:
@@ -179,7 +178,7 @@ def _status(argv: list[str]) -> int:
             print(version("coopoc"))
             return 0
         status = _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
-        sys.stdout.flush()
+        print(end="", flush=True)  # whether there is a stdout or not
         return status
     except ModuleNotFoundError as error:
         if (known := missing(error, " ".join(["coopoc", *argv[:1]]))) is error:

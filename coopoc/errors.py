@@ -54,9 +54,9 @@ def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
     >>> suggestion("tracee", ("trace", "det"), "Pick one.")
     'Did you mean trace?'
     """
-    names = [one for one in known if len(one) > 1]  # else a quaternion's qx would be meant as x
-    near = difflib.get_close_matches(name if isinstance(name, str) else shown(name), names, n=1)
-    return f"Did you mean {near[0]}?" if near else otherwise
+    names = {one.lower(): one for one in known if len(one) > 1}  # else a quaternion's qx would be meant as x
+    near = difflib.get_close_matches((name if isinstance(name, str) else shown(name)).lower(), names, n=1)
+    return f"Did you mean {names[near[0]]}?" if near else otherwise
 
 
 def unknown(noun: str, name: object, names: Iterable[str], otherwise: str | None = None) -> InputError:

@@ -15,7 +15,7 @@ import safetensors
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from coopoc.arrays import check_fields, instance, named
+from coopoc.arrays import check_fields, instance, named, number
 from coopoc.errors import InputError, shown
 from coopoc.formats.seals import UNSEALED, holds, sealed
 from coopoc.plugins import find, in_file, path_of, points
@@ -48,10 +48,9 @@ class Checkpoint:
 
     def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""
-        if self.history is None or not 0 <= row < len(self.history):
-            held = 0 if self.history is None else len(self.history)
-            raise InputError("row", row, f"must be in 0..{held - 1}", "This checkpoint holds no more weights.")
-        return unflatten(self.history[row], self.model)
+        rows = () if self.history is None else self.history
+        allowed, hint = f"in 0..{len(rows) - 1}", "This checkpoint holds no more weights."
+        return unflatten(rows[number("row", row, 0, len(rows) - 1, kind=int, allowed=allowed, hint=hint)], self.model)
 
     def kept(self, row: int) -> int:
         """Row up to `row` whose weights validated best: those kept by a training that ended there.

@@ -14,13 +14,14 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from coopoc import InputError, Method, paired_difference
-from coopoc.arrays import number
+from coopoc.arrays import seed_of
 from coopoc.errors import said, unknown
-from coopoc.evaluate.scores import scored
+from coopoc.evaluate.scores import causal, scored
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.plugins import find, in_file
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
+from coopoc.study.style import NOT_CAUSAL
 from coopoc.workers import progress_bar
 
 from .convoys import CONVOYS, convoy_row
@@ -82,7 +83,7 @@ def benchmark(
         return run_worlds(methods, out / "worlds", worlds, seed, validation, jobs)
     by_name = {task.name: task for task in (VALIDATION if validation else TASKS)}
     if seed is not None:
-        drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
+        drawn = seed_of(seed)
         by_name = {name: replace(task, seed=drawn) for name, task in by_name.items()}
     every = (*by_name, *LOGGED, *roads(data), *CONVOYS)
     for name in tasks:
@@ -129,11 +130,13 @@ def tried(name: str, task: Task) -> Row:
     measured, fleet = recording(task, held in ("", "fleet"))
     one(measured.between(0, 3), [task.columns[0]])  # compiles
     scores = scored(one, measured, [fleet.ids[k] for k in task.columns], fleet)
-    row: Row = {"task": task.name, "rt_le_m": rounded(scores["rt_le_m"])}
+    if in_file(name) and not causal(one, measured, task.columns):
+        held = ""
+    row: Row = {"task": task.name, "rt_le_m": rounded(scores["rt_le_m"]), "information": held}
     if held:
         least = bound(task, held)
         rms = np.sqrt(np.mean(scores["rt_le_m"] ** 2))
-        row |= {"bound_m": round(least, 4), "information": held, "over_bound": round(rms / least, 3)}
+        row |= {"bound_m": round(least, 4), "over_bound": round(rms / least, 3)}
     if "nees_inside" in scores:
         row["nees_inside"] = round(scores["nees_inside"].mean(), 3)
     row["received_bytes_per_second"] = round(scores["bytes_per_second"].mean())
@@ -242,5 +245,5 @@ def _simulated(cards: Sequence[Params]) -> list[Row]:
 def _cell(row: Params) -> str:
     if "failed" in row:
         return "failed"
-    ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else ""
+    ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else NOT_CAUSAL * (row.get("information") == "")
     return f"{three(row['rt_le_m'][0])}{ratio}"

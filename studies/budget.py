@@ -32,7 +32,7 @@ MOST_NEIGHBOURS = NEIGHBOURS[-1]
 RATES = (1.0, 2.0, 5.0)
 CAPS = (100.0, 200.0, 400.0, 800.0)
 SCHEDULES = ("nearest", "round robin")
-FREE = {"rate_hz": 0.0, "cap_bytes_per_second": 0.0, "schedule": SCHEDULES[0]}
+FREE = {"rate_hz": None, "cap_bytes_per_second": None, "schedule": SCHEDULES[0]}
 AXES = ("channel", "max_neighbours", *FREE)
 """Parameters of a channel."""
 WORDS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cpm": "CPM, 5 Hz"}
@@ -85,7 +85,7 @@ def choices(results: Results) -> "pd.DataFrame":
     if not {*names, PAYLOAD} <= set(rows):
         return rows.iloc[:0]
     ideal = rows[(rows["channel"] == "ideal") & (rows["method"] != "bound")].fillna({PAYLOAD: 0.0})
-    return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
+    return ideal.groupby(names, sort=False, dropna=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
 
 
 def _findings(results: Results) -> dict[str, str]:

@@ -14,7 +14,7 @@ from coopoc.world.recording import MEASURED
 
 from .pose_drives import hashed
 from .roads import BLOCK_SECONDS, ROADS, seen
-from .tasks import blocks_of, located, planar, received, rounded
+from .tasks import blocks_of, costs, located, planar, rounded
 
 CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
 """Task -> road whose drive is cut."""
@@ -106,5 +106,4 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}
     if track.covariance is not None:
         row["nees"] = round(np.nanmean(nees), 2)
-    row["received_bytes_per_second"] = received(track, recording, method)
-    return row | {"microseconds_per_step": round(1e6 * track.seconds / track.x[..., 0].size, 2)}
+    return row | costs(track, recording, method)

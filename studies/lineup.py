@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc import InputError, Study
-from coopoc.arrays import Floats, refuse
+from coopoc.arrays import Floats, one_of, refuse
 from coopoc.errors import unknown
 from coopoc.plugins import find, in_file, names
 from coopoc.study.study import Params, Row
+from coopoc.study.style import NOT_CAUSAL
 from coopoc.text import given_path
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -22,6 +23,8 @@ if TYPE_CHECKING:  # they load numba, for which a mistake in --set need not wait
     from coopoc import Method, NoiseModel
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint")
+NOISE_MODELS = ("identity", "nominal", "fitted", "oracle", "none")
+"""Of a registered method, "none" of one that assumes nothing."""
 BOUND = ("bound", "bound")
 """The bound as (method, noise model)."""
 PAST = ("bound", "with its past")
@@ -67,6 +70,8 @@ def key(p: Params) -> dict[str, str]:
         digests["weights"] = weights.key(p["method"], p)
     elif p["method"] != "bound":
         find("coopoc.methods", p["method"])
+        if not in_file(p["method"]):
+            one_of("noise model", p.get("noise_model", "nominal"), NOISE_MODELS)
     if p.get("metric"):
         find("coopoc.metrics", p["metric"])
     if p.get("noise_model") == "fitted":
@@ -115,18 +120,18 @@ def own(name: str, noise: "NoiseModel | str" = "nominal") -> Any:
     Raises:
         InputError: an unknown name, a class that takes no noise model, or what no study can use.
     """
-    from coopoc import Method
+    from coopoc import Message, Method
 
     shows = "docs/extend.md shows one; its first argument is noise_model."
     try:
         method = find("coopoc.methods", name)(noise)
     except TypeError as error:
         raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", shows) from error
-    if not (isinstance(method, Method) and isinstance(method.name, str)):
+    if not (isinstance(method, Method) and isinstance(method.name, str) and isinstance(method.message, Message)):
         raise InputError(
             "method",
             repr(name),
-            "must have a name (text), cooperative (a bool) and a message, and take a recording",
+            "must have a name (text), cooperative (a bool) and a Message, and take a recording",
             shows,
         )
     return method
@@ -166,7 +171,7 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
         p: parameters of the cell.
         quantiles: number of quantiles of the distances in each row.
     """
-    from coopoc.evaluate.scores import rows_of, scored
+    from coopoc.evaluate.scores import causal, rows_of, scored
     from coopoc.methods.catalogue import METHODS
 
     (recording, who, drive), metric = scene.trial(p), p.get("metric", "")
@@ -174,7 +179,9 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
     strange = p["method"] not in METHODS and not weights.is_trained(p["method"])
     for seed, method in methods(p):
         columns = scored(method, recording, who, drive, quantiles, metric)
-        more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
+        more: Row = {} if seed is None else {"train_seed": seed}
+        if strange:
+            more["label"] = method.name + ("" if causal(method, recording, who) else NOT_CAUSAL)
         table += rows_of(columns, who, **more)
     return table
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import V2X, Fleet, InputError, PoseFilter, Recording, Sensors, Study, Track, heading_error, pose_nees
-from coopoc.arrays import Floats
+from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, Study, Track, heading_error, pose_nees
+from coopoc.arrays import Floats, one_of
 from coopoc.data.source import split
 from coopoc.evaluate.metrics import errors, fix_innovations
 from coopoc.evaluate.scores import online_columns
@@ -82,8 +82,7 @@ def key(p: Params) -> dict[str, str]:
     Raises:
         InputError: data or a part to calibrate on that cannot be used, an unknown method.
     """
-    if p["method"] not in EVERY:
-        raise InputError("method", p["method"], f"must be among {list(EVERY)}", "Name one of them.")
+    one_of("method", p["method"], EVERY)
     source = drives.source(p["data"])
     source.check(drives.calibrated(p))
     channel(p)

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Outliers, Recording, Sensors, observe
-from coopoc.arrays import Bools
+from coopoc.arrays import Bools, number, one_of, seed_of
 from coopoc.data.source import split, there
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
@@ -152,8 +152,7 @@ def lasting(noise: Sensors, own: float, common: float) -> Sensors:
 def start(p: Params) -> Start:
     """Start of the filters of a cell: "gnss", the first fix, unless it names "true", the true position."""
     begin: Start = p.get("start", "gnss")
-    if begin not in get_args(Start):
-        raise InputError("start", repr(begin), "must be gnss or true", "The first fix, or the true position.")
+    one_of("start", begin, Start)
     return begin
 
 
@@ -202,7 +201,8 @@ def idle(results: "Results") -> set[str]:
     """Settings that do nothing in these results: of noise where it was measured, of training where there was none, and
     those that are off."""
     p = results.settings
-    off = {n for n, value in p.items() if value in ("", None) or (value == 0 and type(value) in (bool, float))}
+    zeros = {n for n, value in p.items() if value == 0 and type(value) in (bool, float) and n not in CHANNEL}
+    off = {n for n, value in p.items() if value in ("", None)} | zeros
     trained = {"trained", "fitted"} & {*results.frame.get("noise_model", ["trained"])}
     drawn = ("seed", "runs", *SIMULATED) if is_real(p["data"]) else ()
     return off | set(drawn) | set(() if trained else TRAINING)
@@ -221,23 +221,24 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def channel(p: Params) -> V2X:
-    """Neighbourhood and budget of the cell, ideal where it names nothing else.
+CHANNEL = {
+    "radius_m": "radius",
+    "rate_hz": "rate",
+    "cap_bytes_per_second": "bytes_per_second",
+    "loss": "loss",
+    "burst": "burst",
+    "latency_s": "latency",
+    "schedule": "schedule",
+}
+"""Settings of a channel -> fields of V2X; None is the channel's own, and 0 is 0."""
 
-    A cap of 0 is none; a radius of 0 is 30 m, or all that a log has; a rate of 0, and None for loss, burst and
-    latency, are the channel's own.
-    """
+
+def channel(p: Params) -> V2X:
+    """Neighbourhood and budget of the cell, ideal where it names nothing else; the radius of a log has no limit."""
     usual = channel_of(p.get("channel", "ideal"), p.get("max_neighbours", 0))
-    losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
-    options: dict[str, Any] = {field: value for field, value in losses.items() if value is not None}
-    return replace(
-        usual,
-        radius=p.get("radius_m", 30.0) or (float("inf") if is_real(p["data"]) else 30.0),
-        rate=p.get("rate_hz") or usual.rate,
-        bytes_per_second=p.get("cap_bytes_per_second") or float("inf"),
-        schedule=p.get("schedule", usual.schedule),
-        **options,
-    )
+    if p.get("radius_m", 30.0) is None and is_real(p["data"]):
+        usual = replace(usual, radius=float("inf"))
+    return replace(usual, **{field: p[name] for name, field in CHANNEL.items() if p.get(name) is not None})
 
 
 def facts(p: Params) -> Mapping[str, str]:
@@ -247,8 +248,8 @@ def facts(p: Params) -> Mapping[str, str]:
         InputError: parameters that no cell can be computed with.
     """
     sensors(p), attacking(p), channel(p), start(p), egos(p)
-    if p.get("runs", 1) < 1:
-        raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
+    number("runs", p.get("runs", 1), 1, kind=int, allowed=">= 1", hint="Give the number of noise draws.")
+    seed_of(p.get("seed", 0))
     return {"code": revision(*CODE), **_digests(p["data"])}
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from coopoc.study.numbers import Results, present, ran, rms
 from coopoc.study.style import look
-from coopoc.study.tables import Table
+from coopoc.study.tables import Table, smooths
 
 from . import lineup, scene
 from .views import Plot, TableView, of, table
@@ -12,8 +12,8 @@ from .views import Plot, TableView, of, table
 METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-filter", "bound")
 CONDITIONS: dict[str, Any] = {
     "channel": "ideal",
-    "rate_hz": 0.0,
-    "cap_bytes_per_second": 0.0,
+    "rate_hz": None,
+    "cap_bytes_per_second": None,
     "loss": None,
     "burst": None,
     "latency_s": None,
@@ -76,7 +76,8 @@ def _findings(results: Results) -> dict[str, str]:
         pairs = rows[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
         each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
-        ranked = sorted((v, pair) for pair, v in each.items() if pair[0] not in ("bound", "batch-smoother"))
+        online = {pair: v for pair, v in each.items() if pair[0] != "bound" and not smooths([look(pair[0]).label])}
+        ranked = sorted((v, pair) for pair, v in online.items())
         if ranked:
             value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
@@ -89,7 +90,7 @@ STUDY = lineup.study(
     "side_by_side",
     "How do these methods compare with each other and with the bound?",
     grid={"max_neighbours": (0, 2, 6), "method": METHODS, "noise_model": ("nominal",)},
-    settings={**scene.TOWN, "radius_m": 0.0, **scene.WEIGHTS, **CONDITIONS, "runs": 10, "train_seeds": 1},
+    settings={**scene.TOWN, "radius_m": None, **scene.WEIGHTS, **CONDITIONS, "runs": 10, "train_seeds": 1},
     reference=None,
     shares=("max_neighbours",),
     tables={

@@ -222,9 +222,7 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     elif track.heading is not None:
         row["heading_deg"] = round(float(np.nanmean(np.rad2deg(blocks(heading_error(track, fleet)[0])))), 3)
         row["nees"] = round(np.nanmean(pose_nees(track, fleet)[0, start:]), 2)
-    row["received_bytes_per_second"] = received(track, recording, made)
-    row["microseconds_per_step"] = round(1e6 * track.seconds / len(recording.t) / len(ids), 2)
-    return row
+    return row | costs(track, recording, made)
 
 
 def rounded(errors: Floats) -> list[float]:
@@ -241,9 +239,11 @@ def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
     return gap, np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
 
 
-def received(track: Track, recording: Recording, method: Any) -> int:
-    """B/s on air that an ego receives."""
-    return round(float(online_columns(track, recording, method)["bytes_per_second"].mean()))
+def costs(track: Track, recording: Recording, method: Any) -> Row:
+    """B/s on air that an ego receives, and us of a step."""
+    received = round(float(online_columns(track, recording, method)["bytes_per_second"].mean()))
+    step = round(1e6 * track.seconds / track.x[..., 0].size, 2)
+    return {"received_bytes_per_second": received, "microseconds_per_step": step}
 
 
 def blocks_of(error: Floats, start: int, length: float) -> Floats:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from coopoc import V2X, InputError, Sensors, observe
+from coopoc.arrays import number
 from coopoc.errors import unknown
 from coopoc.plugins import file_digest, find, from_file, in_file
 from coopoc.study.study import Params
@@ -34,8 +35,9 @@ WORST = 1.1
 
 
 def seeds(p: Params) -> range:
-    """Training seeds of a study."""
-    return range(p["train_seeds"])
+    """Training seeds of a study with a trained method."""
+    hint = "Each seed trains once."
+    return range(number("train_seeds", p["train_seeds"], 1, kind=int, allowed=">= 1 for a trained method", hint=hint))
 
 
 def trainable(p: Params) -> bool:

@@ -170,6 +170,7 @@ def test_a_late_fix_is_nearly_used_up():
     [
         ("gnss", {"gnss": [1.0, np.nan, 2.0]}),
         ("velocity", {"velocity": [1.0, 2.0]}),
+        ("velocity", {"velocity": [1e5, 0.0, 0.0]}),
         ("dt", {"dt": 0.0}),
         ("fix_age", {"fix_age": np.nan}),
         ("fix_age", {"fix_age": 0.7}),

@@ -92,6 +92,7 @@ def test_a_channel_that_is_not_there_is_named():
     assert scene.channel({"channel": "bsm", "max_neighbours": 4, "radius_m": 50.0}) == V2X(
         4, 50.0, rate=10.0, latency=0.06, loss=0.03, burst=5.0, overhead=212
     )
+    assert scene.channel({"radius_m": 0.0, "cap_bytes_per_second": 0.0}) == V2X(0, 0.0, bytes_per_second=0.0)
 
 
 @pytest.mark.slow

@@ -39,6 +39,10 @@ def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path, short
     for wrong, said in (
         ({"method": "kalman,jont"}, r"method = 'jont': must be one of .* Did you mean joint\?"),
         ({"runs": 0}, r"runs = 0: must be >= 1"),
+        ({"seed": -1}, r"seed = -1: must be in 0"),
+        ({"method": "okf", "train_seeds": 0}, r"train_seeds = 0: must be >= 1"),
+        ({"noise_model": "nominl"}, r"Did you mean nominal\?"),
+        ({"rate_hz": 0}, r"rate = 0: must be > 0"),
     ):
         with refused(said):
             run_study("side_by_side", tmp_path, settings={"data": short_town, **wrong})

@@ -68,6 +68,7 @@ def test_settings_are_read_as_the_type_of_their_default():
         ({"rums": "1"}, r"setting = 'rums': must be one of .*Did you mean runs\?"),
         ({"runs": "many"}, "runs = 'many': must be a whole number"),
         ({"runs": "2.5"}, "runs = '2.5': must be a whole number"),
+        ({"runs": None}, "runs = None: must be a whole number"),
         ({"ratio": "high"}, "ratio = 'high': must be a number"),
         ({"egos": "0,x"}, "egos = 'x': must be a whole number"),
     ],
@@ -80,6 +81,8 @@ def test_a_setting_that_cannot_be_is_named(changes, message):
 def test_grids_that_cannot_be():
     with refused("must not name an axis"):
         study(settings={"k": 1})
+    with refused("k = .*must be a sequence"):
+        study(grid={"k": iter((1, 2))})
     with refused("must have at least one"):
         study(where=lambda p: False).cells()
     with refused(r"grid = \{'k': 4, 'method': 'a'\}: must not be there twice"):

@@ -148,11 +148,15 @@ def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path):
     study = Study(
         "odd",
         "?",
-        lambda p: {"none": [], "own": [{"x": 1}], "mixed": [{"y": 1}, {"y": "a"}]}[p["x"]],
-        {"x": ("none", "own", "mixed")},
+        lambda p: {"none": [], "own": [{"x": 1}], "mixed": [{"y": 1}, {"y": "a"}], "one": {"y": 1}, "once": iter([{}])}[
+            p["x"]
+        ],
+        {"x": ("none", "own", "mixed", "one", "once")},
     )
     reasons = list(run_study(study, tmp_path).failures["reason"])
     assert "at least one row" in reasons[0]
+    assert "rows = 'y': must be a mapping" in reasons[3]
+    assert "must be a sequence" in reasons[4]
     assert "must not repeat a parameter" in reasons[1]
     assert reasons[2].startswith("Arrow")
 

@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ import coopoc as co
 from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, Ints
 from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
-from coopoc.evaluate.scores import scored
+from coopoc.evaluate.scores import causal, scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
 from coopoc.kernels.stars.cooperative_messages import fading_memory
@@ -250,23 +251,27 @@ def test_no_truth_of_another_drive_is_taken(use, other):
 
 
 @dataclass(frozen=True)
-class Negative(co.Kalman):
-    """A method whose covariance is another from the fifth step on."""
+class Changed(co.Kalman):
+    """A method that returns something else."""
 
     name: str = "negative"
-    share: float = 0.0
+    change: Callable[..., Any] = replace
 
-    def __call__(self, recording: co.Recording, egos: Any = (0,)) -> co.Track:
-        track = super().__call__(recording, egos)
-        covariance = np.array(track.covariance)
-        covariance[:, 5:] = np.eye(3) + self.share * np.eye(3, k=1) if self.share else -np.eye(3)
-        return replace(track, covariance=covariance)
+    def __call__(self, recording: co.Recording, egos: Any = (0,)) -> Any:
+        return self.change(super().__call__(recording, egos))
+
+
+def negative(track: co.Track, share: float = 0.0) -> co.Track:
+    """With another covariance from the fifth step on."""
+    covariance = np.array(track.covariance)
+    covariance[:, 5:] = np.eye(3) + share * np.eye(3, k=1) if share else -np.eye(3)
+    return replace(track, covariance=covariance)
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-7, 1e-5, 0.1])
 def test_a_covariance_that_is_none_is_named_with_its_method_and_step(share):
     """-I, and an identity whose halves differ by more than rounding: with a truth, and without one."""
-    method = Negative(share=share)
+    method = Changed(change=partial(negative, share=share))
     with nullcontext() if share == 1e-7 else refused("at step 5: must be symmetric .*, and negative returns another"):
         scored(method, SEEN, ["a"], FLEET)
     with nullcontext() if share == 1e-7 else refused("at step 5: must be symmetric"):
@@ -281,16 +286,30 @@ def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane():
     assert_allclose(*flat)
 
 
-class Swapped(co.Kalman):
-    """A method that returns its egos in another order."""
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda track: co.Kalman()(SEEN, ["b", "a"]),
+        lambda track: co.Kalman()(SEEN.of_runs([0]), ["a", "b"]),
+        lambda track: replace(track, t=track.t + 1),
+        lambda track: track.x,
+    ],
+)
+def test_estimates_of_others_are_refused(change):
+    with refused("must be a Track"):
+        scored(Changed(change=change), SEEN, ["a", "b"], FLEET)
 
-    def __call__(self, recording: co.Recording, egos: Any = (0,)) -> co.Track:
-        return super().__call__(recording, egos[::-1])
+
+def test_a_method_that_knows_later_measurements_is_not_causal():
+    late = Changed(change=lambda track: replace(track, x=track.x + track.x[:, -1:]))
+    assert causal(co.JointFilter(), SEEN, ["a", "b"])
+    assert not causal(late, SEEN, ["a"])
 
 
-def test_estimates_of_other_egos_are_refused():
-    with refused("must be a Track of a, b. Take egos in this order"):
-        scored(Swapped(), SEEN, ["a", "b"], FLEET)
+@pytest.mark.parametrize("given", [{"loss": 1.0}, {"bytes_per_second": 0.0}, {"latency": 9.0}])
+def test_messages_that_are_all_lost_are_noted(given):
+    assert co.JointFilter()(SEEN, ["a"]).notes == ()
+    assert "uses no message" in co.JointFilter()(co.observe(FLEET, S, co.V2X(1, **given)), ["a"]).notes[0]
 
 
 @pytest.mark.parametrize("gap", [(0.0, 0.0, 10.0), (1e-9, 0.0, 0.0)], ids=["above", "in one place"])

@@ -44,7 +44,7 @@ def plot_recording(recording: Recording, ax: "Axes | None" = None, *, run: int =
     >>> plot_recording(observe(fleet, Sensors()), step=1).get_xlabel()
     'East [m]'
     """
-    runs, last = recording.runs, len(recording.t) - 1
+    runs, last = instance("recording", recording, Recording).runs, len(recording.t) - 1
     run = number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}")
     step = number("step", last // 2 if step is None else step, 0, last, kind=int, allowed=f"in 0..{last}")
     ax, fixes, few = axes(ax), recording.gnss[run, :, :, :2], len(recording.ids) <= len(COLORS)
@@ -78,7 +78,8 @@ def plot_track(
     >>> len(plot_track(co.Kalman()(co.observe(fleet, co.Sensors())), fleet=fleet).lines)
     2
     """
-    run = number("run", run, 0, len(track.x) - 1, kind=int, allowed=f"in 0..{len(track.x) - 1}")
+    last = len(instance("track", track, Track).x) - 1
+    run = number("run", run, 0, last, kind=int, allowed=f"in 0..{last}")
     fair = max(len(track.t) // 40, 1)
     every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
     if fleet is not None:
@@ -116,8 +117,10 @@ def plot_solution(solution: "Solution", ax: "Axes | None" = None, *, problem: "P
     [2.4, 1.2]
     """
     from ..optimize.model.problem import Problem
+    from ..optimize.solution import Solution
 
-    ax, at, few = axes(ax), solution.position[:, :2], len(solution.names) <= NAMED
+    few = len(instance("solution", solution, Solution).names) <= NAMED
+    ax, at = axes(ax), solution.position[:, :2]
     if problem is not None:
         if instance("problem", problem, Problem).names != solution.names:
             raise InputError("problem", repr(problem), "must be the one that was solved", "Give it to both.")

@@ -7,10 +7,10 @@ import numpy as np
 
 from ..arrays import AnyArray, Floats
 from ..errors import InputError, shown
-from ..methods.gaps import follow
+from ..methods.gaps import follow, needs_fix
 from ..methods.track import Method, Track, far_off
 from ..world.fleet import Fleet
-from ..world.recording import Recording
+from ..world.recording import Recording, Vehicles
 from .ledger import Kind, Way, of_track
 from .metrics import errors, innovation_columns, max_error, measure, nees, neighbour_rt_le, rt_le, share_of_average
 
@@ -69,12 +69,13 @@ def scored(
     known = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
     for part in slabs(recording, len(egos)):
         track = follow(method, part, egos)
-        if getattr(track, "egos", None) != tuple(map(part.ids.index, egos)):
+        wanted = tuple(map(part.ids.index, egos)), part.runs, *part.t.tolist()
+        if (track.egos, len(track.x), *track.t.tolist()) != wanted:
             raise InputError(
                 f"estimates of {method.name}",
                 shown(track),
                 f"must be a Track of {', '.join(egos)}",
-                "Take egos in this order.",
+                "Take egos in this order, every run, and the times of the recording.",
             )
         seconds += track.seconds
         parts.append(_errors(track, drive, part, quantiles) if known else innovation_columns(track, part))
@@ -95,6 +96,19 @@ def scored(
     if squares:
         more["nees_inside"] = share_of_average(np.sum(squares, axis=0) / recording.runs, recording.runs)
     return {**{name: np.broadcast_to(value, columns["left_fixes"].shape) for name, value in more.items()}, **columns}
+
+
+def causal(method: Method, recording: Recording, egos: Vehicles) -> bool:
+    """Whether estimates of the first half of a drive are the same, to 1 mm in the first run, where the drive ends then.
+
+    A method that knows later measurements changes them, and one that draws random numbers anew.
+    """
+    first = recording.of_runs(slice(1))
+    half = first.between(0, max(len(recording.t) // 2, 2))
+    if not (there := [ego for ego in egos if half.stretches(ego, fixed=needs_fix(method))]):
+        return True
+    whole, part = (follow(method, each, there).x[:, : len(half.t)] for each in (first, half))
+    return not (np.abs(whole - part) > 1e-3).any()
 
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:

@@ -12,7 +12,7 @@ from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..workers import progress_bar
 from ..world.inbox import Inbox, inbox
-from ..world.recording import Recording, Vehicles, check_recording
+from ..world.recording import UNLIKELY, Recording, Vehicles, check_recording
 from .doubts import doubts
 from .gaps import needs_fix
 from .noise_model import NoiseModel
@@ -59,6 +59,8 @@ def follow_egos(
         for e, ego in enumerate(columns):
             messages = inbox(recording, ego, method.message)
             received[:, e], sent[:, e] = messages.received_bytes, messages.sent_bytes
+            if messages.newest.max(initial=-2) == -1 and method.message.numbers and not recording.landmarks:
+                notes = (*notes, f"{UNLIKELY}{recording.ids[ego]} uses no message: all are lost, too many or too old")
             for result in follow(ego, messages):
                 x[:, result.step, e], cov[:, result.step, e] = result.x, result.covariance
                 here = slice(None) if result.links is None else np.searchsorted(messages.link, result.links)

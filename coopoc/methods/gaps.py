@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import instance
 from ..errors import InputError
 from ..world.recording import Recording, Vehicles, check_recording
 from .track import Method, Track
@@ -61,7 +62,8 @@ def needs_fix(method: Any) -> bool:
 
 
 def noted(track: Track) -> Track:
-    """The track with a note of its gaps; InputError for an ego that has no estimate at all."""
+    """The track with a note of its gaps; InputError for an ego that has no estimate at all, or for what is no Track."""
+    track = instance("what the method returns", track, Track, "docs/extend.md shows one.")
     if track.absent is None:
         return track
     for ego in np.array(track.egos)[track.absent.all(axis=0)].tolist():

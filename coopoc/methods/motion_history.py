@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ..arrays import Floats, number, plain
 from ..errors import InputError
 from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
-from ..world.plausible import MAX_POSITION
+from ..world.plausible import MAX_POSITION, MAX_SPEED
 
 
 class MotionHistory:
@@ -57,7 +57,7 @@ class MotionHistory:
             allowed="finite and > 0",
             hint="Give the seconds since the last step.",
         )
-        three("velocity", velocity)
+        three("velocity", velocity, MAX_SPEED)
         if np.isnan(fix_or_none(gnss)).all():
             return
         kept = min(self.rows[0, 2] + float(dt), self.rows[0, 3])
@@ -73,13 +73,15 @@ class MotionHistory:
             if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
                 self.check(gnss, velocity, dt, fix_age)
             row[:3], row[3:6], row[6], row[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-            if any(abs(number) > MAX_POSITION for number in row.tolist()):
+            if any(abs(number) > most for number, most in zip(row.tolist(), LARGEST, strict=True)):
                 self.check(gnss, velocity, dt, fix_age)
         except Exception:  # a class from elsewhere may raise anything
             self.check(gnss, velocity, dt, fix_age)
             raise
 
 
+LARGEST = (MAX_POSITION,) * 3 + (MAX_SPEED,) * 3 + (MAX_POSITION,) * 2
+"""Of fix m, velocity m/s, dt and age s."""
 PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
 """What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
 
@@ -90,11 +92,11 @@ def three(field: str, value: npt.ArrayLike, limit: float = MAX_POSITION) -> Floa
     >>> three("velocity", [1, 2])
     Traceback (most recent call last):
     ...
-    coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers. Give east, north, up.
+    coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers within +-1e+08. Give east, north, up.
     """
     array = numbers(value)
     if array.shape != (3,) or not (np.abs(array) <= limit).all():
-        raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
+        raise InputError(field, value, f"must be three finite numbers within +-{limit:g}", "Give east, north, up.")
     return array
 
 

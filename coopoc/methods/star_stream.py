@@ -32,7 +32,7 @@ from ..kernels.stars.cooperative_state import (
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_step
 from ..world.links import drop_steep_azimuths
-from ..world.plausible import MAX_POSITION, radians
+from ..world.plausible import MAX_POSITION, MAX_SPEED, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
 from .motion_history import MotionHistory, fix_or_none, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
@@ -86,7 +86,7 @@ class RelativeMeasurement:
         if self.odometer is not None:
             row[ODOMETER:SPEED] = three("neighbour's odometer", self.odometer)
         if self.velocity is not None:
-            row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
+            row[SPEED:STEP] = three("neighbour's velocity", self.velocity, MAX_SPEED)
         if 0 < np.isfinite(row[SOLO:STEP]).sum() < STEP - SOLO:
             allowed = f"of {self.id} must hold position, velocity, variance and odometer"
             raise InputError("message", "a part of one", allowed, "Send stream.broadcast.")

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, number, refuse, texts
-from ..errors import InputError, shown
+from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, named, number, refuse, texts
+from ..errors import InputError
 from ..text import short_repr
 from ..world.fleet import columns, same_drive
 from ..world.long_table import long_table
@@ -95,14 +95,11 @@ class Track:
             self.__dict__[name] = texts(name, getattr(self, name))
         if self.ids:
             columns("egos", self.egos, self.ids)
-        if not isinstance(self.extras, Mapping):
-            raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
+        given = named("extras", self.extras, "Give name -> (R, T, E), {} for none.")
         each, by_link = ("(R, T, E)", x.shape[:3]), dict[int, tuple[str, tuple[int, ...]]]()
         if self.neighbours is not None:
             by_link[2] = "(R, L)", self.neighbours.shape[:2]
-        extras = {
-            name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in self.extras.items()
-        }
+        extras = {name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in given.items()}
         self.__dict__["extras"] = extras
         if self.absent is not None:
             self.__dict__["absent"] = checked("absent", self.absent, "(T, E)", x.shape[1:3], bool)

@@ -93,7 +93,7 @@ def parse(name: str, value: Any, default: Any) -> Any:
     """
     if isinstance(default, list | tuple):
         return tuple(parse(name, v, default[0] if default else None) for v in entries(value) if v != "")
-    if value is None or default is None:
+    if default is None:
         return None if value is None or str(value).lower() == "none" else _guess(value)
     kind = type(default)
     if kind is str and isinstance(value, list | tuple):

@@ -14,6 +14,7 @@ from joblib.externals.loky import process_executor
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 from threadpoolctl import threadpool_limits
 
+from ..arrays import listed, named
 from ..errors import InputError
 from ..workers import leave_with
 from . import store
@@ -92,9 +93,10 @@ def _in_worker(function: Function, cell: Cell, parent: int) -> Outcome:
 
 
 def _checked(rows: Sequence[Row], cell: Cell) -> pa.Table:
-    if not rows:
-        raise InputError("rows", "none", "a cell must return at least one row", "Return one dict per run and ego.")
-    table = store.to_table(rows)
+    hint = "Return a list of one dict per run and ego."
+    table = store.to_table([named("rows", row, hint) for row in listed("rows", rows, hint)])
+    if not len(table):
+        raise InputError("rows", "none", "a cell must return at least one row", hint)
     taken = {*table.column_names} & {*cell.params, *store.OWN_COLUMNS}
     if taken:
         raise InputError("rows", sorted(taken), "must not repeat a parameter", "The engine adds those columns.")

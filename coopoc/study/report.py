@@ -61,7 +61,9 @@ def report(
     sections = [_section(given_path(folder)) for folder in listed("folders", folders, "Give a list of folders.")]
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
-        raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
+        raise InputError(
+            "folders", names or "none", "must be at least one, of different studies", "Give coopoc report FOLDER."
+        )
     several = sections if len(sections) > 1 else []
     opening = [{**s["figures"][0], "section": s["name"]} for s in several if s["figures"]]
     opening.sort(key=lambda figure: figure["section"] != first)

@@ -191,8 +191,5 @@ def _as_path(name: str, value: Any, out: str | Path) -> Any:
             return value
     file = Path(out) / "data" / f"{digest(recording)[:12]}{truth.digest[:8] if truth is not None else ''}.npz"
     if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_suffix(".part.npz")
-        save_recording(recording, part, truth)
-        part.replace(file)
+        store.write(file, lambda whole: save_recording(recording, whole, truth))
     return str(file)

@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..arrays import listed
 from ..errors import InputError, unknown
 from ..plugins import file_digest, find, from_file, in_file
 from ..text import file_name
@@ -102,7 +103,7 @@ class Study:
     def values(self) -> dict[str, list[Scalar]]:
         """Values of each axis."""
         if isinstance(self.grid, Mapping):
-            return {name: list(values) for name, values in self.grid.items()}
+            return {name: listed(name, values, "Give a tuple of values.") for name, values in self.grid.items()}
         names = dict.fromkeys(name for params in self.grid for name in params)
         return {name: list(dict.fromkeys(p[name] for p in self.grid if name in p)) for name in names}
 
@@ -222,7 +223,7 @@ def _check_used(study: Study, name: str) -> None:
 
 
 def _narrow(grid: Any, name: str, value: Any, values: Sequence[Scalar]) -> Any:
-    wanted = [parse(name, v, next((k for k in values if k is not None), None)) for v in entries(value)]
+    wanted = [parse(name, v, None if None in values else next(iter(values), None)) for v in entries(value)]
     if isinstance(grid, Mapping):
         return {**grid, name: wanted}
     for v in wanted:

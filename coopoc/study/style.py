@@ -54,6 +54,8 @@ SUFFIXES = {"m": "m", "s": "s", "hz": "Hz", "deg": "°"}
 """End of a column's name -> unit."""
 
 
+NOT_CAUSAL = ", not causal"
+"""In the label of a method whose estimates change with what is measured later."""
 OWN: dict[str, str] = {}
 """Method that is none of ours -> the name that its class gives itself, as its rows have it."""
 

@@ -16,12 +16,12 @@ from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..text import markdown, spreadsheet, tex, visible
 from .numbers import Number, Results, Where, alike
-from .style import METHODS, label, title, words
+from .style import METHODS, NOT_CAUSAL, label, title, words
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
 REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
-SMOOTHER = METHODS["batch-smoother"].label
+_SMOOTHERS = METHODS["batch-smoother"].label, NOT_CAUSAL
 """Label of the method that uses later measurements, too: it is not compared with the others."""
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
@@ -194,7 +194,7 @@ class Table:
             for j, entry in enumerate(row):
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                if isinstance(mean, float) and math.isfinite(mean) and not names & {*self.unranked, SMOOTHER}:
+                if isinstance(mean, float) and math.isfinite(mean) and not (names & {*self.unranked} or smooths(names)):
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         return [sorted(group, reverse=self.best == "max") for group in places.values()]
 
@@ -238,7 +238,7 @@ def pivot(
         titles[text] = None
         of.setdefault(tuple(label(name, row[name]) for name in down), {})[text] = row
     body = []
-    for labels in sorted(of, key=lambda labels: SMOOTHER in labels):
+    for labels in sorted(of, key=smooths):
         found = (of[labels].get(text) for text in titles)
         entries = (
             Interval(row["mean"], row["low"], row["high"], row["n"]) if row and row["n"] else None for row in found
@@ -246,8 +246,10 @@ def pivot(
         body.append((*labels, *entries))
     missing = int(summary["missing"].sum())
     gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
-    if best and any(SMOOTHER in labels for labels in of):
-        gone.append(f"{SMOOTHER}: knows later measurements, too, and is not ranked.")
+    if best and (late := [labels[-1] for labels in of if smooths(labels)]):
+        gone.append(
+            f"{', '.join(map(str, late))}: knows later measurements, or draws random numbers anew, and is not ranked."
+        )
     made = Table(
         (*map(words, down), *titles),
         tuple(body),
@@ -267,6 +269,15 @@ def pivot(
             if near and alike(results, one, other, value):
                 same_as_best.append((i, j))
     return replace(made, alike=tuple(same_as_best))
+
+
+def smooths(labels: Iterable[object]) -> bool:
+    """Whether one of the labels is that of a method which knows later measurements.
+
+    >>> smooths(["Alpha, not causal"])
+    True
+    """
+    return any(mark in str(name) for name in labels for mark in _SMOOTHERS)
 
 
 def lost(results: Results, where: Where | None = None) -> list[str]:

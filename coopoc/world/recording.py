@@ -377,14 +377,12 @@ def check_links(
 
 def unlikely(recording: Recording) -> tuple[str, ...]:
     """Notes on a recording whose settings or measurements are rather in other units, or contradict each other."""
-    sensors, v2x = recording.sensors, recording.v2x
+    sensors = recording.sensors
     sentences = [
         f"{name} is {std:.3g} rad, which is {np.rad2deg(std):.0f}°"
         for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std")
         if (std := getattr(sensors, name)) > DEGREES_STD
     ]
-    if v2x.latency > v2x.max_age and len(recording.links):
-        sentences.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
     if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
         sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
     return tuple(UNLIKELY + text for text in sentences)

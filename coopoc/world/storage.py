@@ -6,7 +6,7 @@ import math
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
@@ -35,12 +35,12 @@ MAX_BYTES, MAX_INFLATION = 2**31, 1032
 """Bytes of one unpacked file, and of each of its own: no deflated stream unpacks to more."""
 
 
-def save_recording(recording: Recording, path: str | Path, truth: Fleet | None = None) -> None:
+def save_recording(recording: Recording, path: str | Path | IO[bytes], truth: Fleet | None = None) -> None:
     """Write a recording; the same one gives the same bytes.
 
     Args:
         recording: in any number of runs.
-        path: .npz file.
+        path: .npz file, or an open one.
         truth: of the same vehicles at the same steps.
 
     Raises:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from coopoc.arrays import check_fields, instance, listed
-from coopoc.errors import InputError, shown
+from coopoc.errors import InputError
 from coopoc.plugins import find
 
 from ..nets.gain import Gain
@@ -119,8 +119,7 @@ def federate(
     """
     chosen_net = find("coopoc.nets", model) if isinstance(model, str) else model
     start = chosen_net() if isinstance(chosen_net, type) else chosen_net
-    if not isinstance(start, Gain):
-        raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
+    instance("model", start, Gain, "Give GainNet(), or its name.")
     began, plan = time.perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
     names = _names(clients)
     tolerated = plan.tolerated(names)

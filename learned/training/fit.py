@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import Floats, Ints, instance
-from coopoc.errors import InputError, shown
 from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
@@ -91,8 +90,7 @@ def fit(
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
     2
     """
-    if not isinstance(model, Gain):
-        raise InputError("model", shown(model), "must be a Gain", "Give GainNet().")
+    instance("model", model, Gain, "Give GainNet().")
     instance("schedule", schedule, Schedule)
     for field, pieces in (
         ("training", training),

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...world.links import wrap
-from ...world.plausible import MAX_POSITION, MAX_YAW_RATE, UNWRAPPED, radians
+from ...world.plausible import MAX_POSITION, MAX_SPEED, MAX_YAW_RATE, UNWRAPPED, radians
 from ..motion_history import fix_or_none, numbers, three
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ class OwnMeasurement:
         rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
         radians("heading", np.array(heading), UNWRAPPED)
         radians("yaw_rate", np.array(rate), MAX_YAW_RATE)
-        row = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], three("velocity", self.velocity), [rate]])
-        self.__dict__["row"] = row
+        moving = three("velocity", self.velocity, MAX_SPEED)
+        self.__dict__["row"] = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], moving, [rate]])
 
 
 @dataclass(frozen=True, eq=False)
