@@ -222,3 +222,17 @@ def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     found = solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan))))
     assert found.cost == pytest.approx(solve(from_graph(graph, start="file")).cost, rel=1e-6)
     assert sizes.count(max(sizes)) < 30
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_robots_that_see_one_another_turn_to_what_they_see(d):
+    """Of six with unknown headings each sees two others; the truth leads no lower."""
+    rng, space = np.random.default_rng(1), Space(d, has_rotation=True)
+    truth = space.join(rng.uniform(-25, 25, (6, d)), exp(rng.uniform(-1.7, 1.7, (6, space.angles))))
+    problem = Problem(tuple("abcdef"), dimension=d, poses=range(6), x0=truth)
+    problem = problem.add("position", range(6), truth[:, :d] + rng.normal(0, 2, (6, d)), std=2.0)
+    pairs = [(i, (i + k) % 6) for i in range(6) for k in (1, 3)]
+    exact = problem.add("body_spherical", pairs, np.ones((12, d)), std=1.0).linearise(truth).residual[-1] + 1.0
+    std = np.array([0.2, 0.03, 0.03])[:d]
+    problem = problem.add("body_spherical", pairs, exact + std * rng.normal(size=exact.shape), std=std)
+    assert solve(replace(problem, x0=None)).cost < 1.0001 * solve(problem).cost

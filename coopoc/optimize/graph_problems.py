@@ -28,7 +28,7 @@ from .starts.graph_starts import (
     separated,
     unwound,
 )
-from .starts.pose_starts import graph_of, placed, places_all
+from .starts.pose_starts import facing, graph_of, placed
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
@@ -111,7 +111,7 @@ def _raced(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
     unwound: Callable[[Floats], bool],
-    draws: bool | None = False,
+    draws: bool = False,
 ) -> tuple[Problem, Search]:
     """The race of what a graph offers; the problem starts at chained odometry."""
     late: dict[str, Any] = {}
@@ -141,9 +141,10 @@ def started(problem: Problem) -> Problem:
         starts: dict[str, Callable[[], Floats]] = {name: partial(placed, problem, x) for name, x in x0.items()}
         first = starts["odometry"]()
         at = problem.replace_unchecked(x0=frozen(first))
-        at, won = _raced(
-            graph, at, starts | {"odometry": lambda: first}, lambda x: False, None if places_all(problem) else True
-        )
+        starts["odometry"] = lambda: first
+        if any(f.kind == "body_spherical" for f in problem.factors):
+            starts["facing"] = lambda: facing(at)
+        at, won = _raced(graph, at, starts, lambda x: False, True)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
+from ..algebra.sparse import sparse
+from ..descent.levenberg_marquardt import arrive
 from ..model.derivatives import linearise
 from ..model.factor import Factor, fused, stacked, taken, unchecked
 from ..model.measurements import CONVERTED
@@ -32,6 +34,8 @@ ROWS_USED = 300
 """Fixes and ranges of a body that are used, spread over all."""
 FIRST_STEPS, LAST_STEPS = 10, 100
 """Steps from each turn of a body, and from the best of these."""
+ARRIVED = 0.1
+"""m or rad, the last step towards where a body turns."""
 MAX_STD = 1e100
 """Standard deviations, whose square is a number."""
 FIXES = "position", "antenna"
@@ -81,9 +85,21 @@ def along_poses(problem: Problem) -> Floats:
     return with_points(graph, position, rotation, placed)[:, : space.ambient]
 
 
-def places_all(problem: Problem) -> bool:
-    """Whether a start knows all kinds of a problem."""
-    return all(_plain(factor) in PLACING for factor in problem.factors)
+def joining(problem: Problem) -> list[Ints]:
+    """Of each factor that holds nodes in one body, their pairs: relative poses, and points that a pose sees."""
+    every = [(f, f.nodes[f.informative]) for f in problem.factors if _field(f).startswith("relative")]
+    points = np.setdiff1d(np.arange(len(problem.names)), problem.poses)
+    return [n if f.measurement.compares_poses else n[np.isin(n[:, 1], points)] for f, n in every]
+
+
+def facing(problem: Problem) -> Floats:
+    """Nodes (n, ambient) where vectors in place of ranges and angles in body frames lead from x0: by these a pose turns
+    to what it sees, however far."""
+    factors = (
+        unchecked(as_vectors(f), kind="relative_position") if f.kind == "body_spherical" else f for f in problem.factors
+    )
+    part = problem.replace_unchecked(factors=tuple(factors))
+    return arrive(sparse(part), np.array(problem.x0), LAST_STEPS, ARRIVED).x
 
 
 def _plain(factor: Factor) -> str:
@@ -118,7 +134,7 @@ def placed(problem: Problem, x: Floats) -> Floats:
     d, n, x = problem.dimension, len(x), x.copy()
     bare = [unchecked(taken(f, np.flatnonzero(f.informative)), loss=None) for f in problem.factors]
     factors, ranges = [as_vectors(f) if f.kind == CONVERTED else f for f in bare], ranges_of(problem, x)
-    part = parts(n, *(f.nodes for f in factors if _field(f).startswith("relative")))
+    part = parts(n, *joining(problem))
     single, vectors = np.bincount(part)[part] == 1, [f for f in factors if f.kind == "displacement"]
     stays = [part[f.nodes[:, 0]] for f in factors if f.kind.startswith("pose")]
     placing = stacked(f.nodes[:, :2].ravel() for f in factors if f.kind in RANGES or _plain(f) in PLACING)

@@ -14,6 +14,7 @@ from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
 from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
+from .pose_starts import joining
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -51,7 +52,7 @@ def race(
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     unwound: Callable[[Floats], bool],
     grown: str = "",
-    draws: bool | None = False,
+    draws: bool = False,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
@@ -68,7 +69,7 @@ def race(
         late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
         unwound: x -> whether no other minimum of a lower cost is to be feared.
         grown: which of the late starts is tried first where no other went straight.
-        draws: whether points and bodies are started from random places, too; None: where noise explains no end.
+        draws: whether points and bodies are started from random places, too.
     """
     system, taken, arrived = sparse(problem), 0, True
     tried, calm, straight, minima = dict[str, tuple[float, Floats]](), list[float](), set[str](), list[float]()
@@ -92,11 +93,10 @@ def race(
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        x = x if draws is False else descend(x, LATER_STEPS[-1][1])
+        x = descend(x, LATER_STEPS[-1][1]) if draws else x
         ends, least = list[tuple[float, Floats]](), system.cost(x)
-        drawing = least > limit if draws is None else draws
         most = QUIET_DRAWS if least <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
-        for k, away in enumerate(scattered(problem, x) if drawing else ()):
+        for k, away in enumerate(scattered(problem, x) if draws else ()):
             if k >= most:
                 break
             y = descend(away, LATER_STEPS[-1][1])
@@ -178,7 +178,7 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
     center = np.median(at, axis=0)  # what has gone far away draws nothing there
     spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
     normal = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][-1]
-    part = parts(n, *(f.nodes[f.informative] for f in problem.factors if f.kind.startswith(("relative", "body"))))
+    part = parts(n, *joining(problem))
     poses = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
     held = np.concatenate([np.array(problem.fixed, np.int64), *poses])
     free = np.setdiff1d(part if loose is None else part[loose], part[held])
