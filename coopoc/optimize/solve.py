@@ -168,12 +168,12 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
     the problem's notes are of the minima that were found."""
     starts = islice(scattered(problem, first.x), QUIET_DRAWS)
     results = [first, *(backend.run(problem, y, options) for y in starts)]
-    beyond = [max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE) for each in results]
-    costs = [problem.cost(each.x) for each in results]
-    best = min(range(len(results)), key=lambda k: (beyond[k], costs[k]))
-    best = 0 if beyond[best] == beyond[0] and not higher(costs[0], costs[best]) else best
-    least, search = costs[best], problem.search
-    near = [c - least for c, b in zip(costs, beyond, strict=True) if b == FEASIBLE and higher(c, least)]
+    scores = [
+        (max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE), problem.cost(each.x)) for each in results
+    ]
+    best = min(range(len(results)), key=scores.__getitem__)
+    least, search = scores[best][1], problem.search
+    near = [cost - least for beyond, cost in scores if beyond == FEASIBLE and higher(cost, least)]
     notes = (rival(min(near)),) if min(near, default=np.inf) < RIVAL_COST else ()
     steps = sum(each.iterations for each in results) - results[best].iterations
     search = search._replace(start="drawn" if best else search.start, iterations=search.iterations + steps, notes=notes)
