@@ -44,7 +44,7 @@ def measured(name: str = "") -> Path:
     pytest.skip(f"no {name or 'measurements'}: {how}, then set COOPOC_TEST_DATA to the folder of all")
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config):
     """Leave what was skipped, a line a test: `pytest @.pytest_cache/d/skipped/tests` runs that alone."""
     if cache := getattr(config, "cache", None):
         skipped = {report.nodeid for report in terminalreporter.stats.get("skipped", ())}
@@ -56,7 +56,7 @@ def refused(match: str) -> Any:
     return pytest.raises(InputError, match=match)
 
 
-def same_minimum(theirs: Any, ours: Any) -> None:
+def same_minimum(theirs: Any, ours: Any):
     """Of two solutions: cost to 1e-9, estimates and covariances to 1e-6."""
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)

@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import Any
 
@@ -104,17 +104,17 @@ def rearranged(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     """The same numbers in other memory."""
     same = arrays(valid)
 
-    def all_of(change: Callable[[Any], Any]) -> dict[str, Any]:
+    def all_of(change):
         return {name: change(array) for name, array in same.items()}
 
-    def strided(array: Any) -> Any:
+    def strided(array):
         room = np.zeros(tuple(2 * n for n in array.shape), array.dtype)
         view = room[tuple(slice(None, None, 2) for _ in array.shape)]
         view[...] = array
         view.flags.writeable = False
         return view
 
-    def unaligned(array: Any) -> Any:
+    def unaligned(array):
         raw = np.zeros(array.nbytes + 1, np.uint8)[1:]
         view = raw.view(array.dtype).reshape(array.shape)
         view[...] = array

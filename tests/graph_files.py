@@ -7,7 +7,7 @@ import numpy as np
 from coopoc.formats.graph import Graph
 
 
-def write_graph(graph: Graph, path: Path) -> None:
+def write_graph(graph: Graph, path: Path):
     """Write a .pyfg file with stamps and covariances, or a .g2o file with GTSAM's symbol keys and information."""
     pyfg, d = path.suffix == ".pyfg", graph.dimension
     pose, point = f"SE{d}{':QUAT' if d == 3 else ''}", "XY" if d == 2 else "XYZ" if pyfg else "TRACKXYZ"
@@ -21,7 +21,7 @@ def write_graph(graph: Graph, path: Path) -> None:
     names = [name if pyfg else str((ord(name[0]) << 56) + int(name[1:])) for name in graph.names]
     lines = [] if pyfg or d == 2 else ["PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"]
 
-    def line(tag: str, stamp: float, ends: str, numbers: np.ndarray) -> None:
+    def line(tag, stamp, ends, numbers):
         time = [repr(float(stamp))] if pyfg and np.isfinite(stamp) else []
         lines.append(" ".join([tag, *time, ends, *map(repr, numbers.tolist())]))
 

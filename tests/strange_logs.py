@@ -42,10 +42,10 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         place[name] = np.c_[path.real, path.imag, climb * np.sin(0.1 * t + k)]
     place |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
 
-    def at(values: Any, times: Any) -> Any:
+    def at(values, times):
         return np.column_stack([np.interp(times, t, axis) for axis in np.atleast_2d(values.T)])
 
-    def add(name: str, times: Any, kinds: list[str], values: Any, std: float, stated: float = 1.0, **more: Any) -> None:
+    def add(name, times, kinds, values, std, stated=1.0, **more):
         values = values + noise.normal(0, std, values.shape)
         columns = dict(zip(kinds, values.T, strict=True)) | {f"{one}_std": stated * std for one in kinds}
         now = times + fault.get("clocks", {}).get(name, 0.0)

@@ -50,7 +50,7 @@ def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absen
     return holed(recording, 0.5, 0.2, 3 if channel == "lossy and late" else 0) if gaps else recording
 
 
-def compare(known: str, recording: Recording) -> None:
+def compare(known: str, recording: Recording):
     """Positions and covariances of all vehicles that are there throughout, in every run."""
     model = KNOWN[known]
     noise = resolve(model, recording)
@@ -125,7 +125,7 @@ def problem(recording: Recording, known: NoiseModel) -> Any:
     links, seen = recording.links, recording.relative[0]
     std = known.sensors.relative_std
 
-    def residual(flat: Any) -> Any:
+    def residual(flat):
         x = flat.reshape(steps, vehicles, 3)
         d, az, inc = spherical(*(x[links.step, links.neighbour] - x[links.step, links.observer]).T)
         off = np.c_[d - seen[:, 0], wrap(az - seen[:, 1]), wrap(inc - seen[:, 2])]

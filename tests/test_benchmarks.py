@@ -240,7 +240,7 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
     noise = replace(log.recording.sensors, range_std=tasks.RANGE_STD)
     size = int(10 / log.truth.dt)
 
-    def by_hand(made: co.PoseFilter) -> float:
+    def by_hand(made):
         error = np.linalg.norm(made(log.recording, range(4)).x[0] - log.truth.position[:, :4], axis=2)  # type: ignore[union-attr]
         first = range(0, len(error) - size + 1, size)
         return float(np.mean([np.sqrt(np.mean(error[k : k + size] ** 2, axis=0)) for k in first]))

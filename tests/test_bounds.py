@@ -111,7 +111,7 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(nei
         for o in (co.Outliers(), WRONG)
     )
 
-    def bound(seen: co.Recording) -> Any:
+    def bound(seen):
         if everyone:
             return fleet_bound(crossing, S2, v2x, recording=seen)[:, 0]
         return posterior_bound(crossing, S2, 0, v2x, recording=seen)
@@ -125,7 +125,7 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(nei
     assert bound_rt_le(mean) > 1.1 * bound_rt_le(bound(clean))
 
 
-def near(square: np.ndarray, bound: float) -> None:
+def near(square: np.ndarray, bound: float):
     """Squared errors of 40 runs are not below a bound beyond their interval, and not far above it."""
     half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
     assert square.mean() + half > bound

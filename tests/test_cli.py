@@ -196,6 +196,6 @@ def test_an_interrupted_run_says_so_and_resumes(tmp_path, jobs):
     assert 3 <= plan["finished"] < 9
 
 
-def _listen() -> None:
+def _listen():
     """Hear Ctrl-C even where the tests run in the background of a shell, which makes its jobs ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -67,7 +67,7 @@ def parsed(argv: list[str]) -> tuple[str, dict[str, Any]]:
     bind = inspect.signature(function).bind
 
     @functools.wraps(function)
-    def arguments(*given: Any, **options: Any) -> dict[str, Any]:
+    def arguments(*given, **options):
         return dict(bind(*given, **options).arguments)
 
     made = tyro.cli(arguments, prog="coopoc", args=argv, config=(tyro.conf.FlagCreatePairsOff,))

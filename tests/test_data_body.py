@@ -45,7 +45,7 @@ def table(noise: float = 0.0, mirrored: bool = False, compass: bool = True) -> t
     """A log and its truth; the mast measures ranges."""
     rng, rows, truth, cars = np.random.default_rng(5), [], [], drives()
 
-    def add(t: float, name: str, kind: str, value: float, partner: str = "") -> None:
+    def add(t, name, kind, value, partner=""):
         rows.append((t, name, kind, partner, value + noise * rng.normal(0, STD[kind]), STD[kind]))
 
     for name, (place, heading, speed, rate) in cars.items():

@@ -49,7 +49,7 @@ def server():
     state, over = Server({}), threading.Event()
 
     class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
+        def do_GET(self):
             state.asked.append(self.path)
             if state.silent == "all":
                 over.wait()
@@ -66,7 +66,7 @@ def server():
             if state.silent == "body":
                 over.wait()
 
-        def log_message(self, *_: object) -> None:
+        def log_message(self, *_):
             pass
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as served:
@@ -205,7 +205,7 @@ def test_files_of_an_archive_are_verified_one_by_one(cache, server, tmp_path, mo
     made = entry("zipped", files, archive=f"{server.address}/all.zip", opens="set")
     monkeypatch.setattr(fetching, "public", lambda: {"zipped": made})
 
-    def serve(members: dict[str, bytes]) -> None:
+    def serve(members):
         with zipfile.ZipFile(tmp_path / "all.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             for name, data in members.items():
                 archive.writestr(name, data)

@@ -241,7 +241,7 @@ def test_stamps_in_milliseconds_are_found(tmp_path):
 def test_the_commands_take_a_log_and_options(folders, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    def shell(*words: str) -> tuple[int, str]:
+    def shell(*words):
         with pytest.raises(SystemExit) as ended:
             main(list(words))
         return int(ended.value.code or 0), capsys.readouterr().out

@@ -272,7 +272,7 @@ def write_bag(
     ros: int,
     names: Mapping[str, str] = MappingProxyType({}),
     late: float = 0.0,
-) -> None:
+):
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
@@ -281,12 +281,12 @@ def write_bag(
     kind = store.types
     time_type = kind["builtin_interfaces/msg/Time"]
 
-    def header(t: float) -> Any:
+    def header(t):
         stamp = time_type(int(t), round((t - int(t)) * 1e9))
         words = {"stamp": stamp, "frame_id": "map", **({"seq": 0} if ros == 1 else {})}
         return kind["std_msgs/msg/Header"](**words)
 
-    def vector(x: float, y: float, z: float) -> Any:
+    def vector(x, y, z):
         return kind["geometry_msgs/msg/Vector3"](x, y, z)
 
     point, turned = kind["geometry_msgs/msg/Point"], kind["geometry_msgs/msg/Quaternion"]

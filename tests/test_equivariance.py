@@ -74,7 +74,7 @@ CHANGES = {
 
 def assert_equivariant(
     method: Callable[..., co.Track], rec: co.Recording, change: Change, near: float, egos: tuple[str, ...]
-) -> None:
+):
     here, there = method(rec, egos), method(change.of(rec), egos)
     assert_allclose(there.x, here.x @ change.matrix.T + change.shift, rtol=0, atol=near)
     if here.covariance is not None:

@@ -1,7 +1,6 @@
 """The examples run as they stand; the lazy names of the package are those that types see."""
 
 import ast
-from typing import Any
 
 import judge
 import numpy as np
@@ -64,7 +63,7 @@ def test_a_judge_learns_its_targets():
     before = judge.begin(0)
     after = judge.fit(before, rows, 100, 0)
 
-    def loss(weights: Any, head: int) -> float:
+    def loss(weights, head):
         every = np.tile(rows[head], (star.HEADS, 1, 1))
         found = judge.logarithms(*map(judge.torch.from_numpy, (weights.astype(np.float32), every[:, :, :-1])))
         return float(np.abs(found[head].numpy() - every[head, :, -1]).mean())

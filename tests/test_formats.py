@@ -19,7 +19,7 @@ from coopoc.formats.trajectories import Trajectory, read_tum
 from coopoc.formats.values import to_orientation, to_rotation
 
 
-def assert_same(a: Any, b: Any, rtol: float = 0) -> None:
+def assert_same(a: Any, b: Any, rtol: float = 0):
     """Every field of two graphs or trajectories is equal, NaN to NaN; covariances to rtol."""
     for field in fields(a):
         one, two = getattr(a, field.name), getattr(b, field.name)
@@ -42,13 +42,13 @@ def random_graph(dimension: int, seed: int) -> Graph:
     is_pose = np.array([name[0] != "L" for name in names])
     poses, points = np.flatnonzero(is_pose), np.flatnonzero(~is_pose)
 
-    def turns(count: int) -> np.ndarray:
+    def turns(count):
         if dimension == 2:
             return rng.uniform(-7, 7, (count, 1))
         q = rng.normal(size=(count, 4))
         return q / np.linalg.norm(q, axis=1, keepdims=True)
 
-    def cov(count: int, rows: int) -> np.ndarray:
+    def cov(count, rows):
         root = rng.normal(size=(count, rows, 2 * rows)) * np.logspace(0, -2, rows)[:, None]
         return root @ root.swapaxes(-1, -2)
 
@@ -154,7 +154,7 @@ def _matrices(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     return out
 
 
-def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str, int], atol: float = 1e-12) -> None:
+def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str, int], atol: float = 1e-12):
     """Poses, measured poses and covariances; GTSAM orders 3-D covariances rotation first."""
     order = [0, 1, 2] if graph.dimension == 2 else [3, 4, 5, 0, 1, 2]
     assert_allclose(_poses(values, graph, keys), _matrices(graph.position, graph.rotation)[graph.is_pose], atol=atol)

@@ -158,7 +158,7 @@ def _file(path: Path, text: str) -> Path:
     return path
 
 
-def _assert_refused(call: Any, *parts: str) -> None:
+def _assert_refused(call: Any, *parts: str):
     with pytest.raises(InputError) as error:
         call()
     for part in parts:

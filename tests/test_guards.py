@@ -45,7 +45,7 @@ def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table():
     assert columns["left_fixes"].tolist() == [[1.0]] * 3
 
     class Results:
-        def select(self, where: object) -> pd.DataFrame:
+        def select(self, where):
             return pd.DataFrame({"method": ["kalman"] * 3 + ["joint"], "left_fixes": [1.0, 1.0, 0.0, 0.0]})
 
     (note,) = lost(Results())  # type: ignore[arg-type]

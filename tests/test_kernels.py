@@ -29,7 +29,7 @@ def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_o
     for name in "ad":
         importlib.import_module(f"stale_{name}")
 
-    def stamp() -> str:
+    def stamp():
         machine_code._digest.cache_clear()
         return machine_code.stamp(sys.modules["stale_a"].f)
 
@@ -55,7 +55,7 @@ def test_stale_machine_code_of_types_that_are_gone_is_made_again(tmp_path):
         "print(twice(4.0), sum(twice.stats.cache_hits.values()))\n"
     )
 
-    def run() -> str:
+    def run():
         return python(tmp_path / "own.py")
 
     assert (run(), run()) == ("8.0 0\n", "8.0 1\n")

@@ -16,19 +16,19 @@ BLOCKS, NINE = 4, (0,) * 9
 
 
 @as_written
-def solved(a: Floats, eta: Floats, memory: Floats) -> None:
+def solved(a: Floats, eta: Floats, memory: Floats):
     pivot = eliminate(a, a, eta, BLOCKS, BLOCKS, memory)
     substitute(a, eta, BLOCKS, BLOCKS)
     store(memory, 0, pivot)
 
 
 @as_written
-def predicted(a: Floats, process: Floats, memory: Floats) -> None:
+def predicted(a: Floats, process: Floats, memory: Floats):
     predict(a, BLOCKS, BLOCKS, process, memory)
 
 
 @as_written
-def inverted(a: Floats) -> None:
+def inverted(a: Floats):
     store(a, 0, inverse(load(a, 0, zeros(1.0, NINE))))
 
 

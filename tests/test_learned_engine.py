@@ -62,7 +62,7 @@ def grad(leaf: Tensor) -> Tensor:
 
 def test_tanh_and_sigmoid_against_numpy():
     @njit(error_model="numpy")
-    def both(x: np.ndarray, out: np.ndarray) -> None:
+    def both(x, out):
         for i in range(len(x)):
             out[0, i], out[1, i] = tanh(x[i], x.dtype.type), sigmoid(x[i], x.dtype.type)
 

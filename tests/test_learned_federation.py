@@ -39,7 +39,7 @@ from coopoc.methods.track import Method
 class Steady(Gain):
     """A filter with one constant gain per axis: x <- x + dt u + k (z - x - dt u)."""
 
-    def __init__(self, gain: float = 0.3) -> None:
+    def __init__(self, gain: float = 0.3):
         super().__init__()
         self.gain = nn.Parameter(torch.full((3,), gain))
 
@@ -122,7 +122,7 @@ def test_bad_answers_are_rejected_and_training_goes_on(number, faults):
 def test_a_client_that_never_answered_does_not_choose_the_weights(four):
     """Its pieces are not finite, so that its loss is infinite in every round; the others' best round is kept."""
 
-    def without_fixes(pieces: Any) -> Any:
+    def without_fixes(pieces):
         return replace(pieces, gnss=torch.full_like(pieces.gnss, torch.nan))
 
     broken = replace(four[0], training=without_fixes(four[0].training), validation=without_fixes(four[0].validation))
@@ -251,11 +251,11 @@ def replies(weights: Tensor, sizes: Tensor) -> list[Any]:
     from flwr.app import Array, ArrayRecord, Message, MetricRecord, RecordDict
     from flwr.app.metadata import Metadata
 
-    def content(row: Tensor, count: int) -> RecordDict:
+    def content(row, count):
         arrays = ArrayRecord({"a": Array(row[:9].reshape(3, 3).numpy()), "b": Array(row[9:].numpy())})
         return RecordDict({"arrays": arrays, "metrics": MetricRecord({"num-examples": count})})
 
-    def about(node: int) -> Metadata:
+    def about(node):
         return Metadata(
             run_id=1,
             message_id="",

@@ -3,7 +3,7 @@
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from itertools import product
@@ -74,20 +74,20 @@ def room(nodes: Mapping[int, Node]) -> Any:
     class Room(Grid):
         run: Any = None
 
-        def set_run(self, run: Any) -> None: ...
+        def set_run(self, run): ...
 
-        def create_message(self, *args: Any, **options: Any) -> Any: ...
+        def create_message(self, *args, **options): ...
 
-        def get_node_ids(self) -> Iterable[int]:
+        def get_node_ids(self):
             return list(nodes)
 
-        def get_nodes(self) -> Iterable[Any]: ...
+        def get_nodes(self): ...
 
-        def push_messages(self, messages: "Iterable[Message]") -> Iterable[str]: ...
+        def push_messages(self, messages): ...
 
-        def pull_messages(self, message_ids: Iterable[str]) -> "Iterable[Message]": ...
+        def pull_messages(self, message_ids): ...
 
-        def send_and_receive(self, messages: "Iterable[Message]", *, timeout: float | None = None) -> Any:
+        def send_and_receive(self, messages, *, timeout=None):
             return [reply for m in reversed([*messages]) if (reply := nodes[m.metadata.dst_node_id](m))]
 
     return Room()
@@ -118,7 +118,7 @@ def sends(name: str, weights: Tensor, **changes: object) -> Node:
     """A node that answers with these weights, and with values of its own."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 
-    def node(message: "Message") -> "Message":
+    def node(message):
         loss = "training-loss" if message.metadata.message_type == "train" else "validation-loss"
         metrics: dict[str, Any] = {"num-examples": 3, loss: 1.0}
         about: dict[str, Any] = {"name": name, "version": version("coopoc")}
@@ -168,7 +168,7 @@ def test_bad_answers_are_rejected_and_training_goes_on():
         lambda content: content["metrics"].update(more=1.0),
     ]
 
-    def changed(message: "Message", change: Callable[[Any], object]) -> "Message":
+    def changed(message, change):
         reply: Any = sends("more", theta)(message)
         change(reply.content)
         return reply
@@ -242,7 +242,7 @@ def test_a_silent_client_is_absent_and_welcome_back():
     job, fleet = job_of(TINY), drives(3)
     nodes = {i: honest(job, fleet, i) for i in range(3)}
 
-    def sometimes(message: "Message") -> "Message | None":
+    def sometimes(message):
         number: Any = message.content["config"]
         return None if number["server-round"] == 2 else honest(job, fleet, 1)(message)
 

@@ -76,7 +76,7 @@ def alive(word: str) -> list[str]:
     return found
 
 
-def until(true: Callable[[], bool], seconds: float = 300, alive: "subprocess.Popen[bytes] | None" = None) -> None:
+def until(true: Callable[[], bool], seconds: float = 300, alive: "subprocess.Popen[bytes] | None" = None):
     """Wait for something that a process, if one is named, must live to do."""
     end = time.monotonic() + seconds
     while not true():

@@ -31,7 +31,7 @@ def test_parameter_count(in_mult, out_mult, count):
 class Published(nn.Module):
     """KalmanNet architecture 2 as described in its paper, with nn.GRU over sequences of one step; same weights."""
 
-    def __init__(self, net: GainNet) -> None:
+    def __init__(self, net: GainNet):
         super().__init__()
         self.net = net
         self.grus = {}
@@ -45,7 +45,7 @@ class Published(nn.Module):
         return self.grus[name](x[None], h[None])[1][0]
 
     def forward(self, gnss: torch.Tensor, velocity: torch.Tensor, x0: torch.Tensor, dt: float) -> torch.Tensor:
-        def unit(v: torch.Tensor) -> torch.Tensor:
+        def unit(v):
             return v / torch.clamp(torch.sqrt((v * v).sum(1, keepdim=True)), min=1e-12)
 
         n, eye = self.net, torch.eye(3, dtype=gnss.dtype).reshape(1, 9).repeat(len(gnss), 1)

@@ -94,7 +94,7 @@ RECORDING = co.observe(FLEET, SENSORS, CHANNEL)
 TRACK = co.Kalman()(RECORDING, [0, 1])
 
 
-def ours(call: Callable[[], object], what: str) -> None:
+def ours(call: Callable[[], object], what: str):
     """The call has an answer, or ends in an error of ours."""
     try:
         call()
@@ -141,7 +141,7 @@ def test_a_noun_keeps_no_array_that_its_owner_can_change():
     assert fleet.t[3] == 0.3
 
 
-def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL) -> None:
+def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL):
     """Each argument once with each wrong value, the others as given."""
     for name in given:
         for value in wrong:

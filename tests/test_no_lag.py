@@ -11,7 +11,6 @@ from oracles.solo import filterpys
 
 from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.track import Method
 from coopoc.world.inbox import inbox
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
@@ -39,7 +38,7 @@ def test_no_method_falls_behind(name):
     variance of each reading it was 0.19 m (kalman) to 0.55 m (of the whole fleet)."""
     fleet, seen = road()
 
-    def ahead(method: Method) -> np.ndarray:
+    def ahead(method):
         error = method(seen, [0]).x[:, 10:, 0, 0] - fleet.position[10:, 0, 0]
         return np.asarray(error.mean(axis=1))
 

@@ -32,7 +32,7 @@ def drawn(seed: int) -> tuple[co.Fleet, co.Sensors]:
     if rng.uniform() < 0.5:
         fleet = replace(fleet, position=fleet.position + rng.normal(0, gap, (1, count, 3)))
 
-    def std(low: float, high: float) -> float:
+    def std(low, high):
         return float(10 ** rng.uniform(low, high))
 
     even = rng.uniform() < 0.5

@@ -49,7 +49,7 @@ def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(fault, ev
     velocity[:, begins:, EGOS] = FAULTS[fault](velocity[:, begins:, EGOS])
     broken = replace(seen, velocity=velocity)
 
-    def late(method: co.Method) -> tuple[float, co.Track]:
+    def late(method):
         track = method(broken, EGOS)
         return float(np.sqrt(np.square(track.x - truth)[:, 300:].sum(axis=-1).mean())), track
 

@@ -52,7 +52,7 @@ def test_where_plain_gauss_newton_overshoots_for_ever(backend):
 def scipys(problem: Problem) -> tuple[np.ndarray, float]:
     """SciPy's trust-region solver from the same start, with its own difference Jacobian."""
 
-    def residual(flat: np.ndarray) -> np.ndarray:
+    def residual(flat):
         return problem.whiten(flat.reshape(-1, 3))[0]
 
     found = least_squares(residual, initial_guess(problem).ravel(), jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-13)

@@ -1,7 +1,5 @@
 """The sparse Cholesky factor against NumPy's dense one: solves, definiteness, entries of the inverse."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu
@@ -81,7 +79,7 @@ def test_small_matrices_are_factored_by_one_thread():
     cholesky, threads = DenseCholesky(np.arange(151), np.arange(150)), set[int]()
     whole = cholesky._dpotrf
 
-    def counted(*arguments: Any, **options: Any) -> Any:
+    def counted(*arguments, **options):
         threads.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
         return whole(*arguments, **options)
 

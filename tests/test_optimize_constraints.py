@@ -155,11 +155,11 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
         for c in range(3):
             ties[3 * k + c, [3 * i + c, 3 * j + c]] = -1.0, 1.0
 
-    def rise(flat: np.ndarray) -> np.ndarray:
+    def rise(flat):
         x, y, z = flat.reshape(-1, 3).T
         return z - road(x, y)
 
-    def rise_slope(flat: np.ndarray) -> np.ndarray:
+    def rise_slope(flat):
         jacobian = np.zeros((n, 3 * n))
         k = np.arange(n)
         jacobian[k, 3 * k], jacobian[k, 3 * k + 1], jacobian[k, 3 * k + 2] = (
@@ -169,10 +169,10 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
         )
         return jacobian
 
-    def speed(flat: np.ndarray) -> np.ndarray:
+    def speed(flat):
         return np.linalg.norm((ties @ flat).reshape(-1, 3), axis=1) / 0.5
 
-    def speed_slope(flat: np.ndarray) -> np.ndarray:
+    def speed_slope(flat):
         gap = (ties @ flat).reshape(-1, 3)
         unit = gap / np.linalg.norm(gap, axis=1, keepdims=True)
         return np.einsum("kc,kcn->kn", unit, ties.reshape(-1, 3, 3 * n)) / 0.5
@@ -352,7 +352,7 @@ def test_osqp_holds_answers_against_all_kkt_conditions():
 
     from coopoc.optimize.backends.osqp import Programme
 
-    def holds(q: float, x: float, y: float) -> bool:
+    def holds(q, x, y):
         one = eye(1, format="csc")
         sides = np.array([[-1.0], [1.0]])
         return Programme(one, one)._holds(np.ones(1), np.array([q]), *sides, np.array([x]), np.array([y]))

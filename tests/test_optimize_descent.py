@@ -29,7 +29,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
     truth, start = rng.normal(0, 10, (2, 5, 3))
     distance = np.linalg.norm([truth[i] - truth[j] for i, j in pairs], axis=1) + rng.normal(0, 0.5, (3, 10))
 
-    def solved(unit: float) -> tuple[list[int], list[float]]:
+    def solved(unit):
         problem = Problem(names, x0=start).add("position", names, truth, std=2.0 * unit)
         ends = [(names[i], names[j]) for i, j in pairs]
         found = [solve(problem.add("range", ends, measured, std=0.1 * unit)) for measured in distance]

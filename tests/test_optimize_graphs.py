@@ -40,7 +40,7 @@ def test_a_newton_step_promises_the_square_of_its_decrement():
     problem = from_graph(random_graph(11, steps=8, landmarks=2, ranges=12, seen=8, loops=3), start="file")
     moving = np.flatnonzero(problem.movable)
 
-    def gradient(v: np.ndarray) -> np.ndarray:
+    def gradient(v):
         r, J = problem.whiten(moved(problem, problem.x0, v))
         return (J.T @ r)[moving]
 
@@ -153,7 +153,7 @@ def test_a_formula_that_casadi_cannot_run_is_refused():
         del MEASUREMENTS["half_range_of_test"]
 
 
-def assert_gtsams_marginals(covariance: np.ndarray, problem: Problem, x: np.ndarray) -> None:
+def assert_gtsams_marginals(covariance: np.ndarray, problem: Problem, x: np.ndarray):
     """The covariances are those of GTSAM's Bayes tree, and zero where a number cannot move."""
     still, J = ~problem.movable, as_stated(problem).whiten(x)[1]
     theirs = bayes_tree_marginals(J, still, len(problem.names), problem.space.dof)

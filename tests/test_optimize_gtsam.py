@@ -86,7 +86,7 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension, name, loss):
         assert_same_objective(measured(dimension, kind, nodes, noise, Loss(loss, scale) if loss else None))
 
 
-def assert_same_objective(problem: Problem) -> None:
+def assert_same_objective(problem: Problem):
     """Its graph in GTSAM has its cost and gradient."""
     posed, x = which_turn(problem), problem.x0
     at, graph = values(problem.space, posed, x), graph_of(problem, forms(problem))

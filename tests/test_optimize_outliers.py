@@ -149,7 +149,7 @@ def test_wrong_loops_that_agree_with_each_other_are_reported():
     first, swing = loops.nodes[:, 0], exp(np.array([1.0]))
     own, at = drives.rotation[first], drives.position[first]
 
-    def turned(count: int) -> Graph:
+    def turned(count):
         """The first `count` loops as if the second robot were 5 m further along x and turned by 1 rad."""
         some = np.arange(40)[:, None] < count
         there = (at + np.einsum("mij,mj->mi", own, loops.position)) @ swing.T + [5.0, 0.0]

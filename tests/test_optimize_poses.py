@@ -64,7 +64,7 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     found = solve(problem, backend)
     space, movable = problem.space, problem.movable.ravel()
 
-    def residual(step: np.ndarray) -> np.ndarray:
+    def residual(step):
         whole = np.zeros(movable.size)
         whole[movable] = step
         return problem.whiten(space.retract(truth, whole.reshape(9, -1)))[0]
@@ -189,7 +189,7 @@ def test_offsets_that_ranges_share_are_scipys(backend):
     moved = np.diff(path, axis=0) + 0.05 * rng.normal(size=(steps - 1, 2))
     r = np.linalg.norm(anchors[which] - path, axis=1) + np.take([2.0, -0.4], which) + 0.1 * rng.normal(size=steps)
 
-    def residual(u: np.ndarray) -> np.ndarray:
+    def residual(u):
         x, offset = u[:-2].reshape(-1, 2), u[-2:]
         far = np.linalg.norm(anchors[which] - x, axis=1) + offset[which] - r
         return np.concatenate([((np.diff(x, axis=0) - moved) / 0.05).ravel(), far / 0.1, offset / 3.0])

@@ -47,11 +47,11 @@ def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
     """Smallest cost that scipy finds from random starts, over positions or, in the plane, positions and headings."""
     rng, n, d = np.random.default_rng(0), len(problem.names), problem.dimension
 
-    def system(y: Floats) -> tuple[Floats, Any]:
+    def system(y):
         rows = y.reshape(n, -1)
         return problem.whiten(problem.space.join(rows[:, :d], exp(rows[:, 2:]) if problem.poses else None))
 
-    def found() -> float:
+    def found():
         start = rng.uniform(-spread, spread, n * (d + bool(problem.poses)))
         return least_squares(lambda y: system(y)[0], start, jac=lambda y: system(y)[1].toarray()).cost  # type: ignore[no-any-return]
 

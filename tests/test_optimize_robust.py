@@ -105,7 +105,7 @@ def test_scipy_finds_the_same_robust_minimum(name, seed):
     problem = observed(name, seed)
     plain = replace(problem, factors=tuple(replace(f, loss=None) for f in problem.factors))
 
-    def residual(free: np.ndarray) -> np.ndarray:
+    def residual(free):
         return plain.whiten(np.concatenate([problem.x0[:4], free.reshape(2, 3)]))[0]
 
     loss, ours = geman_mcclure if name == "geman-mcclure" else name, solve(problem)

@@ -4,7 +4,6 @@ from many starts and from the truth."""
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +12,7 @@ from scipy.optimize import least_squares
 from coopoc.arrays import Floats
 from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Loss, Problem, solve, solve_gnc
-from coopoc.optimize.algebra.sparse import Sparse
-from coopoc.optimize.descent.levenberg_marquardt import Arrival, arrive
+from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
@@ -29,7 +27,7 @@ def scipys(problem: Problem, start: Floats) -> float:
     free = np.setdiff1d(np.arange(len(problem.names)), problem.fixed)
     whole, shape = start.copy(), (len(free), -1)
 
-    def at(flat: Floats) -> Floats:
+    def at(flat):
         whole[free] = flat.reshape(shape)
         return whole
 
@@ -138,7 +136,7 @@ def outliers(seed: int) -> tuple[Problem, Floats, Floats]:
 def test_robust_solves_find_what_the_truth_leads_to(seed):
     problem, truth, bad = outliers(seed)
 
-    def truncated(x: Floats) -> float:
+    def truncated(x):
         return float(np.minimum(problem.whiten(x)[0] ** 2, 6.635).sum())
 
     found = solve_gnc(problem, [0], throw=False)
@@ -212,7 +210,7 @@ def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     edges = drive.relative(drive.chain(), 0.1, 0.05)
     graph = drive.graph(relative_pose=edges, ranges=drive.ranged(pairs, 0.1))
 
-    def counted(system: Sparse, *rest: Any, **options: Any) -> Arrival:
+    def counted(system, *rest, **options):
         end = arrive(system, *rest, **options)
         sizes.extend([system.size] * end.iterations)
         return end

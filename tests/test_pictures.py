@@ -25,7 +25,6 @@ from coopoc.evaluate.pictures import ellipses
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
 from coopoc.study.report import report
-from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table
@@ -176,7 +175,7 @@ def cell(p: Params) -> list[Row]:
 
 
 def test_pages_and_tables_show_names_as_text(tmp_path):
-    def table(results: Results) -> Table:
+    def table(results):
         rows = tuple((name, 1.0, f"{name} [m]") for name in ALL.values())
         return Table(("Name", "RT-LE", r"$\input{x}$"), rows, " ".join(ALL.values()), notes=tuple(ALL.values()))
 

@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -126,7 +125,7 @@ def test_a_fleet_is_filterpys_extended_kalman_filter(formation):
             ekf.update(z, lambda x, H=H: H, lambda x, H=H: H @ x, np.diag([1.0, 1.0, 0.25, 0.05**2]))
         mine = range(packed.first[t], packed.first[t + 1])
 
-        def h(x: Any, pairs: Any = 4 * packed.ends[mine]) -> Any:
+        def h(x, pairs=4 * packed.ends[mine]):
             return np.concatenate([oracle.spherical(x[i : i + 4], x[j : j + 3]) for i, j in pairs])
 
         z, angle = packed.relative[0, mine].ravel(), np.tile([False, True, True], len(mine))

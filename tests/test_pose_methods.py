@@ -123,7 +123,7 @@ def test_the_gate_keeps_outliers_out():
     relative[:, ::20, 0] += 20.0
     wrong = replace(seen, relative=relative)
 
-    def error(recording: co.Recording, gate: float) -> float:
+    def error(recording, gate):
         return float(co.rt_le(co.PoseFilter("fleet", gate=gate)(recording, [1, 2]), fleet).mean())
 
     clean = error(seen, np.inf)

@@ -34,7 +34,7 @@ def test_noise_that_acts_is_learned_from_a_wrong_start():
     method = co.PoseFilter("fleet", exact=False)
     task = PoseTask(observed(fleet, acting, runs=12), fleet, fleet.ids, method, 20)
 
-    def score(assumed: co.Sensors) -> float:
+    def score(assumed):
         track = replace(method, assumed=assumed)(task.recording, fleet.ids)
         return float(log_score(track, fleet)[:, 20:].mean())
 

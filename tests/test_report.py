@@ -15,7 +15,7 @@ VOID = {"meta", "link", "img"}
 class Page(HTMLParser):
     """Collects tags, attributes that refer to something, ids and text, and checks that tags close in order."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str):
         super().__init__()
         self.tags: list[str] = []
         self.open: list[str] = []
@@ -24,7 +24,7 @@ class Page(HTMLParser):
         self.text = ""
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]):
         self.tags.append(tag)
         if tag not in VOID:
             self.open.append(tag)
@@ -35,10 +35,10 @@ class Page(HTMLParser):
             if name == "id":
                 self.ids.append(value or "")
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag: str):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data: str):
         self.text += data
 
 

@@ -65,7 +65,7 @@ def evil(tmp_path):
     return path, mark
 
 
-def edited(path: Path, change: Callable[[Any], Any]) -> None:
+def edited(path: Path, change: Callable[[Any], Any]):
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
 
 
@@ -234,7 +234,7 @@ def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row():
 def test_a_flipped_bit_is_noticed(tmp_path):
     """Of 4,000 flips without checksums 200 gave other numbers; now every one is noticed, that of the seal, too."""
 
-    def noise(p: Params) -> list[Row]:
+    def noise(p):
         draws = np.random.default_rng(0).normal(size=(40, 20))
         return [{"run": r, "ego": "a", "rt_le_m": float(d[0]), "quantiles": d.tolist()} for r, d in enumerate(draws)]
 

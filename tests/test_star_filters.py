@@ -109,7 +109,7 @@ def label(pair: Any) -> str:
     )
 
 
-def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: Recording, near: float = 1e-7) -> None:
+def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: Recording, near: float = 1e-7):
     known, ego = known_of(method, recording), 0
     track, sent = method(recording, [ego]), {}
     if isinstance(method, MSMV | CovarianceIntersection):
@@ -190,7 +190,7 @@ def star_of_four(formation: Fleet) -> tuple[Recording, NoiseModel]:
     return recording, NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
 
 
-def begin(peer: KalmanFilter, z: np.ndarray, noise: np.ndarray, at: np.ndarray) -> None:
+def begin(peer: KalmanFilter, z: np.ndarray, noise: np.ndarray, at: np.ndarray):
     """The first update, in which filterpy's own would lose seven digits to the flat prior."""
     weight = peer.H.T @ np.linalg.inv(noise)
     peer.P = np.linalg.inv(np.eye(len(at)) / 1e6 + weight @ peer.H)

@@ -10,7 +10,6 @@ from conftest import refused
 
 from coopoc.study.cell import assignments, parse
 from coopoc.study.provenance import code_of
-from coopoc.study.results import Results
 from coopoc.study.run import find_study, plan, run_study
 from coopoc.study.study import Study, digest
 from coopoc.study.tables import Table, pivot
@@ -219,7 +218,7 @@ def test_a_view_is_checked_before_the_first_cell(tmp_path, view, message):
 
 
 def test_names_of_views_are_names_of_files(tmp_path):
-    def view(results: Results) -> Table | None:
+    def view(results):
         return None
 
     with refused("must be a file name"):

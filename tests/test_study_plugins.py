@@ -11,7 +11,7 @@ from shell import python
 from coopoc import plugins
 
 
-def install(folder: Path, name: str, points: str) -> None:
+def install(folder: Path, name: str, points: str):
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")

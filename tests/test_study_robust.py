@@ -15,7 +15,6 @@ from small_runs import COMMAND, ENV, files, numbers, shown, start
 
 from coopoc.study import store
 from coopoc.study.run import plan, run_study
-from coopoc.study.study import Params, Row
 
 
 @pytest.mark.slow
@@ -127,7 +126,7 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
 
 
 def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(study, tmp_path):
-    def cell(params: Params) -> list[Row]:
+    def cell(params):
         for finished in sorted((tmp_path / "small/cells").glob("*.parquet"))[:1]:
             finished.unlink()
         return study.cell(params)

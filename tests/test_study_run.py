@@ -59,7 +59,7 @@ def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study, tmp_pat
 
 
 def test_a_view_that_fails_is_raised_and_named_beside_the_others(study, tmp_path):
-    def broken(results: object) -> None:
+    def broken(results):
         raise ZeroDivisionError("of the study")
 
     wrong = replace(study, figures={"broken": broken, **study.figures})
@@ -171,7 +171,7 @@ def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first():
 
 
 def test_a_cell_runs_on_one_thread(tmp_path):
-    def cell(p: object) -> list[dict[str, object]]:
+    def cell(p):
         from threadpoolctl import threadpool_info
 
         return [{"threads": max(library["num_threads"] for library in threadpool_info())}]
@@ -184,7 +184,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "kept"
     store.write(path, "old")
 
-    def broken(file: object) -> None:
+    def broken(file):
         file.write(b"half")  # type: ignore[attr-defined]
         raise OSError("no space left on device")
 

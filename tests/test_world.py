@@ -23,7 +23,7 @@ from coopoc import (
     observe,
 )
 from coopoc.world.channels import lost
-from coopoc.world.inbox import Inbox, inbox
+from coopoc.world.inbox import inbox
 from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.sensors import stream
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -188,7 +188,7 @@ def test_gilbert_elliott_share_and_burst():
 def test_loss_delay_and_rate_act_on_messages(formation):
     fleet = formation.between(0, 200)
 
-    def box_of(**channel: float) -> Inbox:
+    def box_of(**channel):
         return inbox(observe(fleet, S2, V2X(4, **channel), runs=6, observers=[0]), 0, FIX_AND_VELOCITY)  # type: ignore[arg-type]
 
     box, lossy, late, slow = box_of(), box_of(loss=0.3), box_of(latency=0.25), box_of(rate=2.0)

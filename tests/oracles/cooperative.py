@@ -61,7 +61,7 @@ Name = tuple[Any, ...]
 class Belief:
     """A Gaussian of named vectors."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.names: list[Name] = []
         self.x, self.p = np.zeros(0), np.zeros((0, 0))
 
@@ -69,14 +69,14 @@ class Belief:
         k = self.names.index(name)
         return slice(3 * k, 3 * k + 3)
 
-    def add(self, name: Name, mean: Any, variance: Any) -> None:
+    def add(self, name: Name, mean: Any, variance: Any):
         n = len(self.x)
         p = np.zeros((n + 3, n + 3))
         p[:n, :n], p[n:, n:] = self.p, np.diag(np.broadcast_to(variance, 3))
         self.names.append(name)
         self.x, self.p = np.append(self.x, np.broadcast_to(mean, 3)), p
 
-    def transform(self, name: Name, terms: dict[Name, float]) -> None:
+    def transform(self, name: Name, terms: dict[Name, float]):
         """The vector becomes a sum of others."""
         f = np.eye(len(self.x))
         f[self.at(*name)] = 0
@@ -84,18 +84,18 @@ class Belief:
             f[self.at(*name), self.at(*other)] = factor * np.eye(3)
         self.x, self.p = f @ self.x, f @ self.p @ f.T
 
-    def drop(self, name: Name) -> None:
+    def drop(self, name: Name):
         if name in self.names:
             keep = np.ones(len(self.x), bool)
             keep[self.at(*name)] = False
             self.names.remove(name)
             self.x, self.p = self.x[keep], self.p[np.ix_(keep, keep)]
 
-    def noise(self, name: Name, variance: Any) -> None:
+    def noise(self, name: Name, variance: Any):
         at = self.at(*name)
         self.p[at, at] += np.diag(np.broadcast_to(variance, 3))
 
-    def row(self, terms: dict[Name, Any], axis: int) -> Floats:
+    def row(self, terms: dict[Name, Any], axis) -> Floats:
         """h of one number: a vector's factor is one for its axis, or three for its numbers."""
         h = np.zeros(len(self.x))
         for name, factor in terms.items():
@@ -120,7 +120,7 @@ class Belief:
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
 
-    def average(self, which: list[int], prior: Any, odds: float) -> None:
+    def average(self, which: list[int], prior: Any, odds: float):
         """All of these numbers are 0, or N(0, prior)."""
         some = [i for i in which if self.p[i, i] > 0]
         if not some or odds == -inf:
@@ -163,7 +163,7 @@ class Life(NamedTuple):
 class Oracle:
     """The filter of one ego in one run."""
 
-    def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, priors: Priors) -> None:
+    def __init__(self, seen: Recording, ego, run, known: NoiseModel, priors: Priors):
         s, measured, self.more = known.sensors, seen.velocity, np.zeros(len(seen.t))
         if priors.fix_gate:  # `test_odometry_fault` has what refers to that
             seen, fault = with_odometry(seen, [ego], known, priors.fix)
@@ -198,7 +198,7 @@ class Oracle:
         self.deaf = False
         self.reset()
 
-    def remember(self, gnss: Floats, velocity: Floats) -> None:
+    def remember(self, gnss: Floats, velocity: Floats):
         """What every vehicle sends: a mean of its fixes, each of which fades with its age."""
         self.mean, self.weight, self.odometer = (np.zeros(gnss.shape) for _ in range(3))
         m, w, o = np.zeros((3, *gnss.shape[1:]))
@@ -209,7 +209,7 @@ class Oracle:
             m = np.where(there, m + (z - m) / np.where(there, self.r[t] * w, 1.0), m)
             self.mean[t], self.weight[t], self.odometer[t] = m, w, o
 
-    def reset(self) -> None:
+    def reset(self):
         self.state, self.lone = self.blank(), None
         self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
 
@@ -254,7 +254,7 @@ class Oracle:
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
 
-    def remember_error(self, t: int) -> None:
+    def remember_error(self, t):
         s, b = self.state, self.state.belief
         s.late += self.dt
         if s.share < 1:
@@ -265,7 +265,7 @@ class Oracle:
             s.products = [*s.products, (t, error @ s.recent / s.weight)]
         s.recent, s.weight, s.late = keep * s.recent + error, keep * s.weight + 1, 0.0
 
-    def lasting(self, t: int) -> float:
+    def lasting(self, t) -> float:
         if not (self.priors.forget and self.state.products):
             return 0.0
         when, p = np.array(self.state.products).T
@@ -282,7 +282,7 @@ class Oracle:
         self.state.cov = np.diag(b.p[x, x])
         return b.x[x], b.p[x, x]
 
-    def compare(self, t: int, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
+    def compare(self, t, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
         """Beside the star, the ego alone: whose answer counts?"""
         if self.lone is None:
             return x, cov
@@ -314,7 +314,7 @@ class Oracle:
         self.state.cov = np.diag(cov)
         return x, cov
 
-    def average(self, b: Belief) -> None:
+    def average(self, b: Belief):
         life, slot = self.life, self.state.slot
         members = sorted((self.ego, *self.state.members), key=lambda j: -slot[j])
         turns = [b.at("o", j).start + i for j in members if ("o", j) in b.names for i in range(3)]
@@ -329,12 +329,12 @@ class Oracle:
             turns = [i for k, i in enumerate(turns) if k % 3 < 2]
             b.average(turns, np.tile(life.turn[:2], len(members)), self.priors.exact * max(len(members), 2))
 
-    def motion(self, t: int) -> tuple[Floats, Floats]:
+    def motion(self, t) -> tuple[Floats, Floats]:
         """The ego's velocity and the variance of its motion, corrected by fixes or not."""
         u, q = self.u[t], self.q[t, self.ego]
         return (u, q + self.grown) if self.corrected_now else (u - self.by[t], q)
 
-    def pace(self, t: int) -> None:
+    def pace(self, t):
         """The most of late speeds, and its direction."""
         dt, u = self.dt, self.u[t]
         speed, late = float(np.linalg.norm(u)), self.state.speed * exp(-dt / SPEED_MEMORY)
@@ -343,7 +343,7 @@ class Oracle:
             self.state.course, self.state.blind = u / speed, 0.0
         self.state.speed = max(speed, late)
 
-    def tries(self, t: int) -> None:
+    def tries(self, t):
         """A step, and perhaps one that slips."""
         share, dt = self.priors.slip * (self.known.sensors is not None), self.dt
         self.pace(t)
@@ -372,25 +372,25 @@ class Oracle:
             self.pending = KNOWN
         self.state.slips = 1 / (1 + exp(min(-odds, 700)))
 
-    def count(self, q: float, logdet: float, numbers: int) -> None:
+    def count(self, q: float, logdet: float, numbers):
         """What the numbers of an update say of a slip."""
         self.state.score -= 0.5 * (q + logdet)
         self.state.numbers += numbers
         self.state.squares += q
 
-    def neighbours(self, t: int) -> tuple[Any, list[int]]:
+    def neighbours(self, t) -> tuple[Any, list[int]]:
         """Links of a step, and the columns that they join."""
         here = np.arange(self.box.start[t], self.box.start[t + 1])
         return here, self.seen.links.neighbour[self.box.link[here]].tolist()
 
-    def gather(self, t: int) -> None:
+    def gather(self, t):
         """The messages of neighbours that are held at a step, and what is measured of them."""
         here, others = (np.empty(0, int), []) if self.deaf else self.neighbours(t)
         links = dict(zip(others, here.tolist(), strict=True))
         self.relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
         self.messages = {j: self.message(link, j) for j, link in links.items()}
 
-    def places(self, t: int, fix: Floats) -> list[Any]:
+    def places(self, t, fix: Floats) -> list[Any]:
         """Where the ego may be, and the variance: by its fix, and by each neighbour."""
         found = [(fix.copy(), self.r[t, self.ego])] if np.isfinite(fix).all() else []
         for j, message in self.messages.items():
@@ -399,7 +399,7 @@ class Oracle:
                 found.append((message.mean + late - to_vector(self.relative[j]), 1 / message.weight + 1))
         return found
 
-    def message(self, link: int, j: int) -> Sent | None:
+    def message(self, link, j) -> Sent | None:
         """The newest one that is held."""
         s = int(self.box.newest[self.run, link])
         if s < 0:
@@ -407,13 +407,13 @@ class Oracle:
         velocity, q = self.seen.velocity[self.run, s, j], self.louder(j) * self.q[s, j]
         return Sent(s, self.mean[s, j], self.weight[s, j], self.odometer[s, j], velocity, q)
 
-    def louder(self, j: int) -> float:
+    def louder(self, j) -> float:
         """Level of a vehicle's motion."""
         s, few = self.state, self.state.mean.get(j, (0.0, 0.0))[0] < AGREEING
         doubted = few and j in s.last and j not in s.trusted and j != self.ego
         return (UNTRUSTED if doubted else 1.0) * exp(s.level[5]) * float(s.louder.get(j, 1.0))
 
-    def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
+    def learn(self, kind, more: float, share: float, numbers=1):
         """What innovations show of a level: derivative and information of their log-likelihood."""
         self.state.learned[kind] += 0.5 * numbers * share * more
         self.state.information[kind] += 0.5 * numbers * share**2
@@ -422,13 +422,13 @@ class Oracle:
         at = self.state.belief.at("x", self.ego)
         return np.diag(self.state.belief.p)[at].sum()
 
-    def corrected(self) -> None:
+    def corrected(self):
         """What the level of motion makes of the ego's variance, after an update."""
         s, now = self.state, self.own_variance()
         s.made = min(s.made * (now / s.whole) ** 2, now)
         s.whole = now
 
-    def begin(self, t: int) -> None:
+    def begin(self, t):
         """The first step."""
         s, b, life = self.state, self.state.belief, self.life
         b.add(("x", self.ego), 0.0, 0.0)
@@ -443,7 +443,7 @@ class Oracle:
         s.trusted.add(self.ego)
         self.start(t, self.fix[t].copy())
 
-    def step(self, t: int, slip: float) -> None:
+    def step(self, t, slip: float):
         s, g, b = self.state, self.priors, self.state.belief
         s.score = s.numbers = s.squares = s.share = 0.0
         self.gather(t)
@@ -508,14 +508,14 @@ class Oracle:
         at = {j: b.x[b.at("x", j)] + s.way.get(j, 0.0) for j in (self.ego, *s.members)}
         return at, sorted(s.members, key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
 
-    def dismiss(self, j: int, measured: bool, doubted: bool) -> None:
+    def dismiss(self, j, measured: bool, doubted: bool):
         if measured and (doubted or j not in self.state.trusted):
             self.doubt(j)
         for kind in "xbor":
             self.state.belief.drop((kind, j))
         self.state.members.remove(j)
 
-    def add_fix(self, t: int, fix: Floats) -> None:
+    def add_fix(self, t, fix: Floats):
         s, louder = self.state, exp(self.state.level[3])
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s.vague:
@@ -533,7 +533,7 @@ class Oracle:
         s.hits["fix"] = s.hits["fix"] + 1 if share < 1 else 0
         self.corrected()
 
-    def go_back(self, t: int, fix: Floats, rows: list[Any]) -> None:
+    def go_back(self, t, fix: Floats, rows: list[Any]):
         """To where the ego was before fixes contradicted it, if it is there again."""
         s, b = self.state, self.state.belief
         q, gap, cov, r = self.mahalanobis(b, rows)
@@ -560,7 +560,7 @@ class Oracle:
         elif near and s.agree > AWAY:
             s.left = None
 
-    def learn_fix(self, kind: int, rows: list[Any]) -> None:
+    def learn_fix(self, kind, rows: list[Any]):
         _, gap, cov, r = self.mahalanobis(self.state.belief, rows)
         total = np.trace(cov) + r.sum()
         square = gap @ gap
@@ -579,7 +579,7 @@ class Oracle:
         cov = h @ b.p @ h.T
         return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
 
-    def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> float:
+    def use_fix(self, t, j, rows: list[Any], again: bool) -> float:
         """The share of its information that is used; trust may be revoked."""
         s, g, b = self.state, self.priors, self.state.belief
         used = [c for c, row in enumerate(rows) if row is not None]
@@ -620,14 +620,14 @@ class Oracle:
             b.updates(h, z, r, share=share)
         return share
 
-    def wrong(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
+    def wrong(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """On average, or locked out, the ego beside a neighbour that is trusted."""
         s = self.state
         trusted = any(i in s.last and i in s.trusted for i in s.members)
         locked = q > self.priors.fix_gate and s.locked.get(j, 0.0) >= PATIENCE and (j != self.ego or trusted)
         return self.wrong_on_average(j, q, gap, cov, r) or locked
 
-    def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
+    def wrong_on_average(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
         s, g = self.state, self.priors
         count, mean = s.mean.get(j, (0.0, np.zeros(3)))
@@ -643,7 +643,7 @@ class Oracle:
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
         return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
 
-    def doubt(self, j: int) -> None:
+    def doubt(self, j):
         s = self.state
         s.trusted.discard(j)
         s.mean.pop(j, None)
@@ -651,7 +651,7 @@ class Oracle:
             s.belief.drop(("b", j))
             s.belief.add(("b", j), 0.0, TAU**2 + self.life.own)
 
-    def start(self, t: int, fix: Floats) -> bool:
+    def start(self, t, fix: Floats) -> bool:
         """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""
         s, g = self.state, self.priors
         places, votes = self.places(t, fix), [1]
@@ -673,7 +673,7 @@ class Oracle:
             s.vague.discard(self.ego)
         return True
 
-    def place(self, x: Floats, variance: Any) -> None:
+    def place(self, x: Floats, variance: Any):
         """The ego anew, whose fixes are trusted."""
         s, b = self.state, self.state.belief
         b.drop(("b", self.ego))
@@ -686,7 +686,7 @@ class Oracle:
         s.mean.pop(self.ego, None)
         s.locked.pop(self.ego, None)
 
-    def outvoted(self, t: int, fix: Floats) -> bool:
+    def outvoted(self, t, fix: Floats) -> bool:
         """Do more fixes agree with one another elsewhere than with the start, and no more neighbours with that?"""
         votes, r, (u, q) = self.state.votes, self.r[t, self.ego] * self.white, self.motion(t)
         if votes and votes[0][1] >= CONFIRMED:
@@ -708,12 +708,12 @@ class Oracle:
         b = self.state.belief
         return self.speak_for(t, b.x[b.at("x", self.ego)] + self.dt * u, fix) <= 0
 
-    def speak_for(self, t: int, here: Floats, there: Floats) -> int:
+    def speak_for(self, t, here: Floats, there: Floats):
         """How many more neighbours put the ego at one place than at another?"""
         near = [sum(q < FIX_GATE for q in self.off(t, at)) for at in (here, there)]
         return near[0] - near[1]
 
-    def off(self, t: int, place: Floats) -> list[float]:
+    def off(self, t, place: Floats) -> list[float]:
         """How far is a place from where each neighbour puts the ego?"""
         std, found = self.std * np.exp(self.state.level[:3] / 2), []
         for j, message in self.messages.items():
@@ -729,7 +729,7 @@ class Oracle:
             found.append(min(float(q), FIX_GATE))
         return found
 
-    def lost(self, t: int) -> bool:
+    def lost(self, t) -> bool:
         s = self.state
         held = [j for j in s.members if j in s.last]
         if any(j in s.trusted for j in held):
@@ -742,16 +742,16 @@ class Oracle:
         agree = error @ error > FIX_GATE * noise and apart[:1] < [FIX_GATE * noise]
         return len(held) >= 2 or bool(len(held) == 1 and (error @ error > WILD * noise or agree))
 
-    def contradicted(self, t: int, j: int) -> bool:
+    def contradicted(self, t, j) -> bool:
         hits, since = self.state.hits[("relative", j)], t - self.state.joined[j]
         most = max(hits)
         return bool(most >= min(CONTRADICTED, max(2, since - most)) or sum(n >= 3 for n in hits) >= 2)
 
-    def fix_terms(self, j: int) -> dict[Name, float]:
+    def fix_terms(self, j) -> dict[Name, float]:
         names = [("x", j), ("b", j), ("common",)]
         return {name: 1.0 for name in names if name in self.state.belief.names}
 
-    def steady(self, t: int, j: int, u: Floats, q: Floats) -> tuple[Floats, Floats]:
+    def steady(self, t, j, u: Floats, q: Floats) -> tuple[Floats, Floats]:
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
         g, dt, louder = self.priors, self.dt, self.state.louder
         last, since, variance, slips = self.state.pace.get(j, (u, -inf, q, 0))
@@ -766,7 +766,7 @@ class Oracle:
         self.state.pace[j] = u, t, q, 0
         return u, q
 
-    def predict(self, moved: Floats, q: Floats) -> None:
+    def predict(self, moved: Floats, q: Floats):
         b, life = self.state.belief, self.life
         self.drive(self.ego, moved)
         b.noise(("x", self.ego), q)
@@ -783,16 +783,16 @@ class Oracle:
             b.transform(("common",), {("common",): life.keep})
             b.noise(("common",), life.common * (1 - life.keep**2))
 
-    def add_turn(self, j: int) -> None:
+    def add_turn(self, j):
         if self.life.turn.any():
             self.state.belief.add(("o", j), 0.0, self.life.turn)
 
-    def turn(self, j: int) -> Floats:
+    def turn(self, j) -> Floats:
         """Errors of an odometry, where they are linear."""
         b: Belief = self.state.belief
         return b.x[b.at("o", j)]
 
-    def turned(self, j: int, moved: Floats) -> tuple[Floats, Floats]:
+    def turned(self, j, moved: Floats) -> tuple[Floats, Floats]:
         """A motion by odometry, corrected, and its derivatives by the errors of it."""
         b, by = self.state.belief, np.zeros((3, 3))
         if ("o", j) not in b.names or (j == self.ego and self.corrected_now):
@@ -803,7 +803,7 @@ class Oracle:
         by[:2, 0], by[:2, 1] = [-way[1], way[0]], way / (1 + scale)
         return np.append(way, moved[2]), by
 
-    def drive(self, j: int, moved: Floats, steps: int = 1) -> None:
+    def drive(self, j, moved: Floats, steps=1):
         b, (way, by) = self.state.belief, self.turned(j, moved)
         b.x[b.at("x", j)] += way
         if j == self.ego and self.state.left:
@@ -817,7 +817,7 @@ class Oracle:
         b.x[o] *= holds
         b.noise(("o", j), (1 - holds**2) * self.life.turn)
 
-    def near(self, j: int) -> Floats:
+    def near(self, j) -> Floats:
         """Where the ego measures a vehicle."""
         b, relative = self.state.belief, self.relative[j]
         far = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
@@ -825,7 +825,7 @@ class Oracle:
         near: Floats = b.x[b.at("x", self.ego)] + gap
         return near
 
-    def join(self, t: int, j: int) -> None:
+    def join(self, t, j):
         s, b, message = self.state, self.state.belief, self.messages[j]
         taken = {s.slot[i] for i in s.members} if s.members else set()
         s.slot[j] = next(k for k in range(1, 10**6) if k not in taken)
@@ -845,7 +845,7 @@ class Oracle:
         if variance:
             b.add(("b", j), 0.0, variance)
 
-    def measure(self, t: int, at: dict[int, Floats], order: list[int]) -> None:
+    def measure(self, t, at: dict[int, Floats], order: list[int]):
         """Linear at the prediction."""
         b = self.state.belief
         if order and ("compass",) in b.names:
@@ -855,7 +855,7 @@ class Oracle:
         for j in order:
             self.relate(t, j, at)
 
-    def relate(self, t: int, j: int, at: dict[int, Floats]) -> None:
+    def relate(self, t, j, at: dict[int, Floats]):
         relative, message = self.relative[j], self.messages[j]
         s, g, there = self.state, self.priors, np.isfinite(relative)
         b, vague, hits = s.belief, j in s.vague, s.hits[("relative", j)]
@@ -909,12 +909,12 @@ class Oracle:
                 self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
         s.vague.discard(j)
 
-    def take(self, t: int, j: int) -> None:
+    def take(self, t, j):
         """Use the newest message, and go on from there."""
         self.messages[j] = self.receive(t, j, self.messages[j])
         self.state.way[j] = self.goes_on(t, j)[0]
 
-    def receive(self, t: int, j: int, message: Sent | None) -> Sent | None:
+    def receive(self, t, j, message: Sent | None) -> Sent | None:
         """Move to where the newest message was sent, use the fixes since the last one; the message as it is used."""
         s, dt, last = self.state, self.dt, self.state.last.get(j)
         b, since = s.belief, s.since[j]
@@ -939,7 +939,7 @@ class Oracle:
         s.last[j], s.since[j] = message, message.step
         return message._replace(process=q)
 
-    def said(self, new: Sent, last: Any, j: int, q: Any, moved: Any, steps: int, follows: bool, c: int) -> Any:
+    def said(self, new: Sent, last: Any, j, q: Any, moved: Any, steps, follows: bool, c) -> Any:
         """Terms, number and variance of the mean of the fixes since the last message, None for none."""
         fade, weight, z = exp(-self.dt / FADES), new.weight[c], new.mean[c]
         old = fade**steps * last.weight[c] if last else 0.0
@@ -962,14 +962,14 @@ class Oracle:
             terms["o", j] = np.outer(-new.velocity, [0, 0, 1])
         return terms, z, white + way * q[c]
 
-    def goes_on(self, t: int, j: int) -> tuple[Floats, Floats]:
+    def goes_on(self, t, j) -> tuple[Floats, Floats]:
         """The way since the newest message, and its derivatives by the errors of odometry."""
         message, (*_, slips) = self.messages[j], self.state.pace.get(j, [0])
         age = (t - self.state.since[j]) * self.dt
         u = np.zeros(3) if message is None else self.state.pace[j][0] if slips else message.velocity
         return self.turned(j, age * u)
 
-    def trust(self) -> None:
+    def trust(self):
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
         s, own = self.state, self.life.own
         b, wide = s.belief, TAU**2 + own
