@@ -30,7 +30,7 @@ from .compiling.small import (
     scale,
     subtract,
 )
-from .compiling.vectors import choose
+from .compiling.vectors import Lanes, choose
 
 GATE, FIX_GATE = 9.0, 12.0
 """Squared normalised innovation of a number, and of a position, from which it weighs less."""
@@ -67,22 +67,20 @@ Vector = tuple[float, ...]
 
 
 @inside
-def inflation(q: float, gate: float, hits: float) -> float:
+def inflation(q: float, gate: float, hits: float) -> Lanes:
     """S' / S: 1 within the gate, q / gate beyond, infinite from HARD_REJECT_FACTOR gates on; 1 again from PATIENCE hits
     on.
 
     So the influence of an innovation falls as 1 / sqrt(q), and ends.
     """
     share = choose(q - HARD_REJECT_FACTOR * gate, math.inf, max(q / gate, 1.0))
-    answer: float = choose(PATIENCE - hits, share, 1.0)
-    return answer
+    return choose(PATIENCE - hits, share, 1.0)
 
 
 @inside
-def count(q: float, gate: float, hits: float, gain: float) -> float:
+def count(q: float, gate: float, hits: float, gain: float) -> Lanes:
     """Next value of the lock-out counter: the gains of measurements beyond the gate, less LEAK of those within."""
-    answer: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
-    return answer
+    return choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
 
 
 @inside
@@ -157,10 +155,9 @@ def gain_of(cov: Vector, variance: Vector) -> float:
 
 
 @inside
-def distance(innovation: Vector, cov: Vector) -> float:
+def distance(innovation: Vector, cov: Vector) -> Lanes:
     """Squared normalised innovation of a position."""
-    answer: float = inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation))
-    return answer
+    return inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation))
 
 
 @inside

@@ -15,7 +15,7 @@ from numba.extending import overload
 from ..arrays import Floats, Ints
 from .compiling.compile import as_written, inner, inside
 from .compiling.small import apply, from_upper, subtract
-from .compiling.vectors import Batched, choose, lane, less, pack, plus
+from .compiling.vectors import Batched, Lanes, choose, lane, less, pack, plus
 
 Five: TypeAlias = tuple[float, float, float, float, float]
 Numbers: TypeAlias = tuple[float, ...]
@@ -91,14 +91,13 @@ def angle(sine: float, cosine: float) -> float:
 
 
 @inner
-def series(sine: float, cosine: float) -> float:
+def series(sine: float, cosine: float) -> Lanes:
     """atan2 of a small angle."""
     t = sine / cosine
     s = t * t
     tail = less(1 / 17, s, less(1 / 19, s, less(1 / 21, s, less(1 / 23, s, 1 / 25))))
     tail = less(1 / 9, s, less(1 / 11, s, less(1 / 13, s, less(1 / 15, s, tail))))
-    answer: float = t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
-    return answer
+    return t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
 
 
 @inner
@@ -141,13 +140,12 @@ def along(polar: Numbers, a: float, b: float, c: float) -> Numbers:
 
 
 @inside
-def spread(polar: Numbers, a: float, b: float, c: float) -> Numbers:
+def spread(polar: Numbers, a: float, b: float, c: float) -> Lanes:
     """a e_r e_r^T + b e_a e_a^T + c e_i e_i^T: a covariance from variances along them, or information from theirs."""
     _, sa, ca, si, ci = polar
     flat, cross = plus(a * si * si, c * ci, ci), (a - c) * si * ci
     xx, yy, zz = plus(flat * ca * ca, b * sa, sa), plus(flat * sa * sa, b * ca, ca), plus(a * ci * ci, c * si, si)
-    answer: tuple[float, ...] = from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
-    return answer
+    return from_upper((xx, (flat - b) * sa * ca, cross * ca, yy, cross * sa, zz))
 
 
 @inside
@@ -205,11 +203,10 @@ def incomplete(measured: Numbers) -> bool:
 
 
 @inside
-def whole(measured: Numbers) -> float:
+def whole(measured: Numbers) -> Lanes:
     """1 where all components were measured, else 0."""
     o = 0.0 * measured[0]
-    answer: float = choose(missing(measured), o, o + 1.0)
-    return answer
+    return choose(missing(measured), o, o + 1.0)
 
 
 @inner

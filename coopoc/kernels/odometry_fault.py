@@ -82,8 +82,7 @@ def correct(state: Floats, velocity: Floats, dt: float) -> float:
     velocity[0] += state[ERROR]
     velocity[1] += state[ERROR + 1]
     grown = dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2]
-    answer: float = 2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0
-    return answer
+    return float(2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0)
 
 
 @part
@@ -123,8 +122,7 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0
-    answer: float = gap2
-    return answer
+    return float(gap2)
 
 
 @part

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -367,17 +367,18 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     white, time, absent = np.ones(3), 1.0, np.full(6, priors.absent)
     own = common = bias = heading = offset = 0.0
     absent[[2, 3, 5]] = max(priors.absent, Priors().absent)  # most are right, on roads, too
-    turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
+    turn = np.square([priors.heading, priors.scale, priors.clock])
     ranged = np.square([priors.range_scale, priors.pair_offset])
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
         white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
-        time = float(sensors.gnss_drift_time)
-        heading, bias = (float(value**2) for value in noise_model.compass)
+        time, (heading, bias) = sensors.gnss_drift_time, np.square(noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
         absent[3:5][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or priors.compass**2, offset or priors.offset**2
-    judged = GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
-    lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, ranged, absent, priors.exact
-    return Model(std, float(least), FORGOTTEN, *lasting, priors.slip, *judged)
+    lasting = own, common, time, white, bias, heading, offset, turn, priors.lasts, ranged, absent, priors.exact
+    judged = priors.slip, GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
+    # whole numbers need no kernel of their own
+    numbers: Any = [np.float64(value) for value in (std, least, FORGOTTEN, *lasting, *judged)]
+    return Model(*numbers)

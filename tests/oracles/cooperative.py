@@ -218,7 +218,7 @@ class Oracle:
         numbers = ("made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed", "spread")
         return SimpleNamespace(
             **{name: {} for name in tables},
-            **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight"), 0.0),
+            **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight", "unsaid"), 0.0),
             **{name: np.zeros(6) for name in ("level", "learned", "information")},
             **{name: np.zeros(3) for name in ("gap", "cov", "course", "recent")},
             **dict.fromkeys(("left", "unused")),
@@ -246,6 +246,7 @@ class Oracle:
             self.tries(t)
             self.remember_error(t)
             x, cov = self.compare(t, *self.answer())
+            cov = cov * (1 + self.state.unsaid / self.state.whole)
             more, white = max(self.lasting(t) - np.trace(cov), 0.0), self.r[t, self.ego] * self.white
             here = x, cov + more * np.diag(white / white.sum())
             b, way = self.state.belief, self.state.way
@@ -425,8 +426,8 @@ class Oracle:
     def corrected(self):
         """What the level of motion makes of the ego's variance, after an update."""
         s, now = self.state, self.own_variance()
-        s.made = min(s.made * (now / s.whole) ** 2, now)
-        s.whole = now
+        left = (now / s.whole) ** 2
+        s.made, s.unsaid, s.whole = min(s.made * left, now), s.unsaid * left, now
 
     def begin(self, t):
         """The first step."""
@@ -498,7 +499,11 @@ class Oracle:
         self.corrected()
         if g.forget:
             step = np.clip(s.learned / (s.information + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
-            s.level = np.clip(s.level + step, MIN_LEVEL, MAX_LEVEL)
+            before, s.level = s.level, np.clip(s.level + step, MIN_LEVEL, MAX_LEVEL)
+            changes, n = np.exp(s.level - before) - 1, self.trusted()
+            if len(self.fix_terms(self.ego)) == 1:
+                fixes = (changes[3] + n * changes[4]) / (1 + n)
+                s.unsaid += s.made * changes[5] + max(s.whole + s.unsaid - s.made, 0.0) * fixes
         s.learned = np.zeros(6)
         s.information = s.information * (exp(-dt / g.forget) if g.forget else 1.0)
 
@@ -622,10 +627,12 @@ class Oracle:
 
     def wrong(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """On average, or locked out, the ego beside a neighbour that is trusted."""
-        s = self.state
-        trusted = any(i in s.last and i in s.trusted for i in s.members)
-        locked = q > self.priors.fix_gate and s.locked.get(j, 0.0) >= PATIENCE and (j != self.ego or trusted)
-        return self.wrong_on_average(j, q, gap, cov, r) or locked
+        locked = q > self.priors.fix_gate and self.state.locked.get(j, 0.0) >= PATIENCE
+        return self.wrong_on_average(j, q, gap, cov, r) or (locked and (j != self.ego or self.trusted() > 0))
+
+    def trusted(self) -> int:
+        """How many members are trusted, of those that have sent a message."""
+        return sum(j in self.state.last and j in self.state.trusted for j in self.state.members)
 
     def wrong_on_average(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
@@ -732,7 +739,7 @@ class Oracle:
     def lost(self, t) -> bool:
         s = self.state
         held = [j for j in s.members if j in s.last]
-        if any(j in s.trusted for j in held):
+        if self.trusted():
             return False
         if self.ego in s.trusted:
             return bool(s.hits["fix"] > 0 and s.locked.get(self.ego, 0.0) >= PATIENCE)

@@ -127,6 +127,8 @@ class Number:
 
 
 Numbers: TypeAlias = Sequence[Number]
+Lanes: TypeAlias = Any
+"""What compiled code returns: a float, LANES of them side by side, or a tuple of such."""
 
 
 def _constant(number: float) -> Any:

@@ -147,8 +147,7 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
         total += e * columns[q, k + OFFSET]
     if o >= 0:
         total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
-    answer: float = total
-    return answer
+    return float(total)
 
 
 @part

@@ -11,11 +11,11 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import apply, negate, store, subtract
+from ..compiling.small import apply, inner_product, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
-from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
+from .cooperative_messages import fix_terms, goes_on, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -62,6 +62,7 @@ from .cooperative_state import (
     copy,
     copy_filter,
     copy_rows,
+    heard,
     is_placed,
     measured_whole,
     new_filter,
@@ -222,8 +223,7 @@ def gather(
             rows[i, SOLO + c] = sent[who[i], run, when, c]
         for c in range(3):
             rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
-    answer: int = count
-    return answer
+    return int(count)
 
 
 @inner
@@ -282,8 +282,7 @@ def step(
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
         compare(f, tries, model, rows, vehicles, count)
-    if model.forget > 0.0:
-        add_lasting(f, tries.first)
+    add_lasting(f, model, tries.first)
 
 
 @inner
@@ -316,7 +315,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
             doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
     f.ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
     if doubts[ALONE_FOR] > 0.0:
-        for i in range(12):
+        for i in range(15):
             f.ego[ANSWER + i] = alone.ego[ANSWER + i]
 
 
@@ -384,10 +383,8 @@ def locate(f: Filter) -> int:
 @inside
 def gap2(f: Filter, k: int) -> float:
     """Squared distance of a member, m^2."""
-    total = 0.0
-    for c in range(3):
-        total += (f.member[k, AT + c] - f.member[0, AT + c]) ** 2
-    return total
+    gap = subtract(vector_at(f.member[k], AT // 3), vector_at(f.member[0], AT // 3))
+    return float(inner_product(gap, gap))
 
 
 @inside
@@ -458,8 +455,7 @@ def measure(f: Filter, model: Model, rows: Floats, members: int) -> None:
     if has(g, 0, COMPASS):  # the compass's noise is new at every step
         i = 3 * g.block[0, COMPASS] + 1
         for j in range(3 * g.vectors[0]):
-            g.p[i, j] = 0.0
-            g.p[j, i] = 0.0
+            g.p[i, j] = g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
     for m in range(members):
         weigh(f, model, rows, f.who[m, ORDER])

@@ -6,17 +6,16 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import add_diagonal, scale, store
+from ..compiling.small import add_diagonal, inner_product, scale, store
 from ..dead_reckoning import ROUNDING
 from ..gate import FIX_GATE, PATIENCE, SLIP, count, inflation
 from .cooperative_members import replace_implausible_velocity, stand
 from .cooperative_state import (
-    ADDED,
     AGE,
     AGREED,
+    BARE,
     CLOCK,
     COUNT,
-    COVARIANCE,
     ESTABLISHED,
     EXTRA_VARIANCE,
     FIXES,
@@ -47,6 +46,7 @@ from .cooperative_state import (
     WHEN,
     Filter,
     Model,
+    heard,
     set_trust,
 )
 from .gaussian import (
@@ -176,8 +176,8 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
     if message_rows(f, model, rows, k, sent, steps, again, follows):
         q = innovate(g, f.h)
-        whole = f.h.block[MEASURED] + f.h.block[MEASURED + 1] + f.h.block[MEASURED + 2] == 3
-        if again and f.member[k, EXTRA_VARIANCE] == 0.0 and status[TRUSTED] > 0.0 and whole:
+        known = again and f.member[k, EXTRA_VARIANCE] == 0.0
+        if known and status[TRUSTED] > 0.0 and sum(f.h.block[MEASURED:]) == 3:
             learn_fix(f, MESSAGES)
         f.member[k, OUT + 3] = use_fix(f, model, k, again, q)
     for c in range(3):
@@ -229,8 +229,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
-    answer: bool = age > ROUNDING
-    return answer
+    return bool(age > ROUNDING)
 
 
 @inner
@@ -245,14 +244,12 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         again: whether it is not the vehicle's first one.
         q: of `innovate`.
     """
-    g, h, j, used = f.g, f.h, f.who[k, VEHICLE], 0
-    for c in range(3):
-        used += h.block[MEASURED + c]
+    g, h, j, used = f.g, f.h, f.who[k, VEHICLE], sum(f.h.block[MEASURED:])
     if f.member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
         insert_from_measurement(g, h, k, f.member[k, EXTRA_VARIANCE])
         f.member[k, EXTRA_VARIANCE] = 0.0
         return 1.0
-    judged = k > 0 or heard(f, False)  # alone, errors of the receiver and of the odometer cannot be separated
+    judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
@@ -263,12 +260,12 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
             innovate(g, h)
             correct(g, h, 1.0)
         return 0.0
-    x, y, z = vector_at(h.three, GAP // 3)
-    q = min(q, (x * x + y * y + z * z) / SLIP)
+    gap = vector_at(h.three, GAP // 3)
+    q = min(q, inner_product(gap, gap) / SLIP)
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
-            own += h.matrix[COV + 4 * c] if judged else f.ego[COVARIANCE + 4 * c] - f.ego[ADDED + c]
+            own += h.matrix[COV + 4 * c] if judged else f.ego[BARE + c]
             noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-f.ego[LEVEL + FIXES]))
     share = 1.0
     if model.fix_gate > 0.0:
@@ -281,22 +278,11 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     return share
 
 
-@part
-def heard(f: Filter, trusted: bool) -> bool:
-    """Whether a neighbour that has sent a message, and perhaps is trusted, is in the star; others stand where the ego
-    measures them."""
-    for k in range(1, len(f.who)):
-        j = f.who[k, VEHICLE]
-        if j >= 0 and f.status[j, USED] > -math.inf and (f.status[j, TRUSTED] > 0.0 or not trusted):
-            return True
-    return False
-
-
 @inside
 def wrong(f: Filter, model: Model, k: int, q: float) -> bool:
     """Whether it is the receiver of member k that errs: on average, or for so long that fixes would be used again, the
     ego's beside a neighbour that is trusted."""
-    locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True))
+    locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True) > 0)
     return wrong_on_average(f, model, k, q) or locked
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
-from ..compiling.small import add, load, store
+from ..compiling.small import add, inner_product, load, store, subtract
 from ..gate import CONFIRMED, FIX_GATE, NOTHING, PATIENCE, Vector, vote
 from .gaussian import (
     ABSENT,
@@ -118,16 +118,17 @@ normalised innovations of range, azimuth and inclination and the share of its me
 was: the ego's are those of its fix."""
 NO_VOTES = (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 51, 54, 63
-AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, VOTES, EGO = 70, 71, 72, 73, 76, 84, 93
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, BARE, LEFT = 20, 26, 32, 38, 51, 54, 63, 66
+AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, EGO = 73, 74, 75, 76, 84, 93, 94
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
-is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
-variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since
-m; for how long s fixes have agreed with its position; s since the last fix; by how many m^2 a step's motion is more
-uncertain where this try takes it as fixes correct it, else 0; and what is added to the covariance m^2 for errors of
-fixes that last, with eight numbers of `lasting` on them; and nine of `gate.vote`."""
+is otherwise than assumed, and position m and covariance m^2; the variances of that before `lasting` adds to them; and
+where it would be m, had fixes not led it away, the variance of that m^2, NOTHING for none, the two numbers of
+`gate.remember` on it, and how far the ego has driven since m; for how long s fixes have agreed with its position; s
+since the last fix; by how many m^2 a step's motion is more uncertain where this try takes it as fixes correct it, else
+0; eight numbers of `lasting`; nine of `gate.vote`; and by how many m^2, axes together, the ego's position is more
+uncertain than its covariance says."""
 
 
 class Filter(NamedTuple):
@@ -305,37 +306,43 @@ def off(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) 
 
 
 @part
+def heard(f: Filter, trusted: bool) -> int:
+    """How many neighbours are in the star that have sent a message, and perhaps are trusted; others stand where the
+    ego measures them."""
+    count = 0
+    for k in range(1, len(f.who)):
+        j = f.who[k, VEHICLE]
+        count += j >= 0 and f.status[j, USED] > -math.inf and (f.status[j, TRUSTED] > 0.0 or not trusted)
+    return count
+
+
+@part
 def needs_restart(f: Filter, own: Floats) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either fixes have contradicted
     it for so long that they would be used again (and turn its odometry towards them), or its receiver is not trusted
     beside others that are not. One other suffices where the error of the ego's fixes would be beyond all doubt, or is
     the other's, too: it is the ego's."""
-    ego, others, last = f.who[0, VEHICLE], 0, 0
+    others, last = heard(f, False), 0
+    if heard(f, True):
+        return False
+    if f.status[f.who[0, VEHICLE], TRUSTED] > 0.0:
+        return bool(f.who[0, HITS] > 0 and f.member[0, LOCKED] >= PATIENCE)
     for k in range(1, len(f.who)):
-        j = f.who[k, VEHICLE]
-        if j >= 0 and f.status[j, USED] > -math.inf:
-            if f.status[j, TRUSTED] > 0.0:
-                return False
-            others, last = others + 1, k
-    if f.status[ego, TRUSTED] > 0.0:
-        answer: bool = f.who[0, HITS] > 0 and f.member[0, LOCKED] >= PATIENCE
-        return answer
-    far, between, noise = 0.0, 0.0, 0.0
-    first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
-    for c in range(3):
-        far, noise = far + f.g.x[first + c] ** 2, noise + own[FIX_VARIANCE + c] / 3.0
-        between += (f.g.x[first + c] - f.g.x[other + c]) ** 2
-    agree = far > FIX_GATE * noise and between < FIX_GATE * noise
-    return others >= 2 or (others == 1 and (far > WILD * noise or agree))
+        last = k if f.who[k, VEHICLE] >= 0 and f.status[f.who[k, VEHICLE], USED] > -math.inf else last
+    error, noise = vector_at(f.g.x, f.g.block[0, ERROR]), sum(vector_at(own, FIX_VARIANCE // 3)) / 3.0
+    gap = subtract(error, vector_at(f.g.x, f.g.block[last, ERROR]))
+    far = inner_product(error, error)
+    agree = far > FIX_GATE * noise and inner_product(gap, gap) < FIX_GATE * noise
+    return others >= 2 or (others == 1 and bool(far > WILD * noise or agree))
 
 
 @part
 def is_placed(own: Floats, rows: Floats, count: int) -> bool:
     """Whether a fix, or what a neighbour sends and the ego measures of it, shows where the ego is."""
-    for i in range(count):
-        if rows[i, AGE] >= 0.0 and measured_whole(rows, i) and math.isfinite(seen_from(rows, i, 0)):
-            return True
-    return math.isfinite(own[FIX])
+    placed = False
+    for i in range(-1, count):
+        placed |= math.isfinite(position(own, rows, i, 0)[0])
+    return placed
 
 
 @part
@@ -351,21 +358,22 @@ def set_trust(f: Filter, j: int, trusted: float, variance: float) -> None:
 
 @part
 def mahalanobis2(own: Floats, rows: Floats, i: int, j: int) -> float:
-    """Squared Mahalanobis distance of two positions of the ego: of a neighbour's message less the measured vector, or,
-    -1, its own fix; infinite if one is missing."""
+    """Squared Mahalanobis distance of two positions of the ego; infinite if one is missing."""
     total = 0.0
     for c in range(3):
-        gap, variance = 0.0, 0.0
-        for k, sign in ((i, 1.0), (j, -1.0)):
-            if k < 0:
-                gap, variance = gap + sign * own[FIX + c], variance + own[FIX_VARIANCE + c]
-            elif rows[k, AGE] < 0.0 or not measured_whole(rows, k):
-                return math.inf
-            else:
-                gap += sign * seen_from(rows, k, c)
-                variance += rows[k, SOLO_VARIANCE + c] + 1.0
-        total += gap * gap / variance
+        (x, p), (y, q) = position(own, rows, i, c), position(own, rows, j, c)
+        total += (x - y) ** 2 / (p + q)
     return total if math.isfinite(total) else math.inf
+
+
+@part
+def position(own: Floats, rows: Floats, i: int, c: int) -> tuple[float, float]:
+    """Component c m of where the ego is, and its variance m^2: by a neighbour's message less the measured vector, or,
+    -1, by its own fix; NaN if that is missing."""
+    if i < 0:
+        return own[FIX + c], own[FIX_VARIANCE + c]
+    there = rows[i, AGE] >= 0.0 and measured_whole(rows, i)
+    return seen_from(rows, i, c) if there else math.nan, rows[i, SOLO_VARIANCE + c] + 1.0
 
 
 @part
@@ -379,13 +387,11 @@ def seen_from(rows: Floats, row: int, c: int) -> float:
 def measured_vector(rows: Floats, row: int, c: int) -> float:
     """Component c of the measured vector to a neighbour, m."""
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    answer: float = d * ci if c == 2 else d * si * (ca if c == 0 else sa)
-    return answer
+    return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
 
 
 @inside
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
     angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)
-    answer: bool = rows[row, 0] >= 0.0 and angles
-    return answer
+    return bool(rows[row, 0] >= 0.0 and angles)

@@ -13,7 +13,7 @@ import numpy as np
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, inner_product, load, scale, store, subtract, zeros
-from ..compiling.vectors import LANES, choose, take
+from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import (
     ANEW,
     BACK,
@@ -122,7 +122,7 @@ def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
 
 
 @inner
-def go_back(star: Star, gates: Gates, state: Floats, n: int) -> float:
+def go_back(star: Star, gates: Gates, state: Floats, n: int) -> Lanes:
     """BACK where the ego goes back to where it was before fixes contradicted it: its state and covariance are; ANEW
     where fixes outvote its start, and neighbours do not speak for that; else 0."""
     at, ego, memory = vector_at(state, 0), load(gates.state, 0, STATE), load(gates.before, 0, BEFORE)
@@ -145,8 +145,7 @@ def go_back(star: Star, gates: Gates, state: Floats, n: int) -> float:
     store(gates.before, 0, (*choose_each(begins, at, there), *kept, evidence, since))
     store(gates.state, 0, (*choose_each(back, spread, ego[:9]), *ego[9:12], choose(back, o, ego[12])))
     store(state, 0, choose_each(back, there, at))
-    answer: float = choose(left, o + ANEW, choose(back, o + BACK, o))
-    return answer
+    return choose(left, o + ANEW, choose(back, o + BACK, o))
 
 
 @inner
@@ -194,14 +193,13 @@ def inflated(measured: Numbers, factor: Numbers) -> Numbers:
 
 
 @inner
-def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> float:
+def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> Lanes:
     """Inflate the variance of a member's position; the gain that it would have had, less than 0 within the gate."""
     variance = variance_of(star, k)
     q = distance(subtract(position_of(star, k), at), add_diagonal(cov, variance))
     store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
     gain: float = gain_of(cov, variance)
-    answer: float = choose(q - FIX_GATE, gain, -gain)
-    return answer
+    return choose(q - FIX_GATE, gain, -gain)
 
 
 @inner

@@ -100,8 +100,7 @@ def new_rows(members: int) -> Rows:
 @inside
 def lanes(g: Gaussian) -> int:
     """LANES of numbers that hold the vectors in use."""
-    answer: int = (3 * g.vectors[0] + LANES - 1) // LANES
-    return answer
+    return int((3 * g.vectors[0] + LANES - 1) // LANES)
 
 
 @inside
@@ -113,8 +112,7 @@ def three_rows(rows: Floats, i: int, wide: int) -> tuple[float, float, float]:
 @part
 def has(g: Gaussian, member: int, kind: int) -> bool:
     """Whether a vector is in the state."""
-    answer: bool = g.block[member, kind] >= 0
-    return answer
+    return bool(g.block[member, kind] >= 0)
 
 
 @part
@@ -123,14 +121,13 @@ def insert(g: Gaussian, member: int, kind: int) -> int:
     b = g.vectors[0]
     g.vectors[0] = b + 1
     g.block[member, kind], g.vectors[1 + b] = b, member * KINDS + kind
-    answer: int = 3 * b
-    return answer
+    return int(3 * b)
 
 
 @part
 def insert_error(g: Gaussian, member: int, kind: int, variance: tuple[float, float, float]) -> None:
     """Insert a vector of mean 0 and of these variances, unless all are 0: there is no such error."""
-    if variance[0] + variance[1] + variance[2] > 0.0:
+    if sum(variance) > 0.0:
         i = insert(g, member, kind)
         for c in range(3):
             g.p[i + c, i + c] = variance[c]

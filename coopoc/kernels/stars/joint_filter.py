@@ -36,7 +36,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
-from ..compiling.vectors import LANES, choose, take
+from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import BACK
 from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
 from .gated import Gates, carry, forget, gate_star, gates_within, go_back, set_ego
@@ -198,7 +198,7 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
 
 
 @inside
-def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
+def first_place(star: Star, k: int, ego: Numbers) -> Lanes:
     """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
     polar = load(star.relative, k, RELATIVE)
     measured: Numbers = add(ego, vector(polar))
@@ -208,8 +208,7 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     near = polar[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
     broadcast = choose_each(new, position_of(star, k), somewhere)
-    answer: tuple[float, ...] = choose_each(missing(polar), broadcast, measured)
-    return answer
+    return choose_each(missing(polar), broadcast, measured)
 
 
 @inner
@@ -226,11 +225,10 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
 
 
 @inside
-def placed(joint: Joint, k: int, measured: Numbers) -> float:
+def placed(joint: Joint, k: int, measured: Numbers) -> Lanes:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
-    answer: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
-    return answer
+    return max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
 
 
 @inner

@@ -14,8 +14,9 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from .cooperative_state import ADDED, CLOCK, COVARIANCE, DT, ERRORS, FIX, FIX_VARIANCE, OUT, Filter
+from .cooperative_state import CLOCK, COVARIANCE, DT, ERRORS, FIX, FIX_VARIANCE, OUT, UNSAID, WHOLE, Filter, Model
 from .gaussian import COMMON, ERROR, has
+from .messages import vector_at
 
 RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
 """Of the ego's fixes: sums of their errors m on each axis and of 1, fading; s since the last one; and number, sum and
@@ -42,21 +43,23 @@ def remember_error(f: Filter, own: Floats) -> None:
         ego[RECENT + c] = keep * ego[RECENT + c] + error
     if ego[WEIGHT] > 0.0:
         ego[PAIRS] += 1.0
-        ego[PRODUCTS] += product / ego[WEIGHT]
-        ego[PRODUCTS2] += (product / ego[WEIGHT]) ** 2
+        product /= ego[WEIGHT]
+        ego[PRODUCTS] += product
+        ego[PRODUCTS2] += product**2
     ego[WEIGHT], ego[WAITED] = keep * ego[WEIGHT] + 1.0, 0.0
 
 
 @part
-def add_lasting(f: Filter, own: Floats) -> None:
-    """Add the variance of errors of fixes that last to the answer's; pairs within two seconds count as one."""
-    n = max(f.ego[PAIRS], 1.0)
-    seconds = min(max(f.ego[CLOCK], SECOND), MEMORY)
+def add_lasting(f: Filter, model: Model, own: Floats) -> None:
+    """Add to the answer's covariance what it is more uncertain by, as levels were otherwise, and the variance of errors
+    of fixes that last; pairs within two seconds count as one."""
+    for i in range(9):
+        f.ego[COVARIANCE + i] *= 1.0 + f.ego[UNSAID] / max(f.ego[WHOLE], 1e-300)
+    n, seconds = max(f.ego[PAIRS], 1.0), min(max(f.ego[CLOCK], SECOND), MEMORY)
     c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / seconds, 1.0 / n)
-    if c <= 0.0 or c * c <= error:
+    if model.forget == 0.0 or c <= 0.0 or c * c <= error:
         return
     stated = f.ego[COVARIANCE] + f.ego[COVARIANCE + 4] + f.ego[COVARIANCE + 8]
-    more = max(c - error / c - stated, 0.0) / (own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2])
+    more = max(c - error / c - stated, 0.0) / sum(vector_at(own, FIX_VARIANCE // 3))
     for i in range(3):
-        f.ego[ADDED + i] = more * own[FIX_VARIANCE + i]
-        f.ego[COVARIANCE + 4 * i] += f.ego[ADDED + i]
+        f.ego[COVARIANCE + 4 * i] += more * own[FIX_VARIANCE + i]

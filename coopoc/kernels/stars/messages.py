@@ -13,7 +13,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, scale, store
-from ..compiling.vectors import LANES, choose, take, unrolled
+from ..compiling.vectors import LANES, Lanes, choose, take, unrolled
 from ..geometry import Numbers, with_std
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
@@ -126,31 +126,27 @@ def block_at(memory: Any, index: Any) -> Any:
 
 
 @inside
-def moved_of(star: Star, k: int) -> Numbers:
+def moved_of(star: Star, k: int) -> Lanes:
     """Motion m of member k since the last step."""
-    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + MOVED)
-    return answer
+    return vector_at(star.motion, 4 * k + MOVED)
 
 
 @inside
-def process_of(star: Star, k: int) -> Numbers:
+def process_of(star: Star, k: int) -> Lanes:
     """Its variance m^2."""
-    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + PROCESS)
-    return answer
+    return vector_at(star.motion, 4 * k + PROCESS)
 
 
 @inside
-def position_of(star: Star, k: int) -> Numbers:
+def position_of(star: Star, k: int) -> Lanes:
     """Position m of member k, as broadcast and brought forward."""
-    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + POSITION)
-    return answer
+    return vector_at(star.motion, 4 * k + POSITION)
 
 
 @inside
-def variance_of(star: Star, k: int) -> Numbers:
+def variance_of(star: Star, k: int) -> Lanes:
     """Its variance m^2."""
-    answer: tuple[float, ...] = vector_at(star.motion, 4 * k + VARIANCE)
-    return answer
+    return vector_at(star.motion, 4 * k + VARIANCE)
 
 
 @inside
@@ -213,8 +209,7 @@ def gather(
                 std = model.relative_std if len(model.relative_std) else UNIT
                 put_lane(star.relative, 8 * k, lane, with_std(measurements.relative[run, link], std))
         interpret(star, model, k, measurements.dt)
-    answer: int = n
-    return answer
+    return int(n)
 
 
 @inside

@@ -20,7 +20,9 @@ the lone one, which counts for a while, twice as long each time.
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
 the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
 over their information, which is forgotten in `Model.forget` s. Of the ego's motion the share is D = dP / d log level,
-which a step of prediction makes D + q, and an update D (P+ / P-)^2; changes of velocity show the level of each
+which a step of prediction makes D + q, and an update D (P+ / P-)^2, and so the variance U by which the estimate errs
+more than P says: what it was made of was weighed by other levels. The answer's covariance is P (1 + U / P), the
+weights are those of P. Changes of velocity show the level of each
 vehicle's motion earlier, if it is more than is assumed. Of fixes beyond doubt counts how they differ from one another:
 those that are all displaced by as much are no noisier.
 
@@ -37,11 +39,12 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
+from ..compiling.small import add, inner_product, scale, store
 from ..odometry_fault import DECISIVE
 from .cooperative_state import (
-    ADDED,
     AGREED,
     ANSWER,
+    BARE,
     BY_FIXES,
     CORRECTED,
     COUNT,
@@ -59,6 +62,7 @@ from .cooperative_state import (
     LOUDER,
     MADE,
     MAX_LOCKOUT,
+    MESSAGES,
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
@@ -70,17 +74,21 @@ from .cooperative_state import (
     STEP,
     TOLD,
     TRUSTED,
+    UNSAID,
     USED,
     VEHICLE,
     WHOLE,
     WIDTH,
     Filter,
     Model,
+    heard,
     new_filter,
 )
 from .gaussian import (
+    COMMON,
     COMPASS,
     COV,
+    ERROR,
     GAP,
     MEASURED,
     PLACE,
@@ -95,6 +103,7 @@ from .gaussian import (
     stretch,
     widen,
 )
+from .messages import vector_at
 
 HEADING, SCALE, OF_COMPASS, OF_RANGE, OF_SCALE, SLIPS, ALONE, LEVELS = range(8)
 """Places in TOLD: the ego's errors, rad, 1, rad, m, 1, whether it slips, whether it has left its star, and the
@@ -149,7 +158,6 @@ def average(f: Filter, model: Model) -> None:
     """
     g, few, n, where = f.g, f.few, 3, len(f.few[0]) - 1
     for c in range(3):
-        f.ego[ADDED + c] = 0.0
         few[c, where], f.ego[ANSWER + c] = c, g.x[c]
         for d in range(3):
             f.ego[COVARIANCE + 3 * c + d] = g.p[c, d]
@@ -180,6 +188,8 @@ def average(f: Filter, model: Model) -> None:
             collapse(f, i, n, there, 3 if model.absent[0] == -math.inf else i + 1)
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
         average_over_all(f, model, own)
+    for c in range(3):
+        f.ego[BARE + c] = f.ego[COVARIANCE + 4 * c]
     for kind in range(5):
         i = scaled if kind == 4 else own + kind - (3 if kind < 2 else 2)
         there = n > scaled if kind == 4 else scaled > own if kind >= 2 else own > 3
@@ -209,8 +219,7 @@ def clock_of(f: Filter, model: Model, k: int) -> float:
         return 0.0
     i = 3 * f.g.block[k, TURN] + 2
     m = f.g.x[i]
-    answer: float = m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2]))
-    return answer
+    return float(m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2])))
 
 
 @part
@@ -332,15 +341,12 @@ def corrected_motion(f: Filter, own: Floats, more: float) -> None:
 @part
 def remember_speed(f: Filter, own: Floats) -> None:
     """The most of late speeds, and its direction: wheels that are locked measure none."""
-    square = 0.0
-    for c in range(3):
-        square += ((own[MOTION + c] + own[BY_FIXES + c]) / own[DT]) ** 2
-    speed, late = math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY)
+    u = scale(add(vector_at(own, MOTION // 3), vector_at(own[BY_FIXES:], 0)), 1.0 / own[DT])
+    speed, late = math.sqrt(inner_product(u, u)), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY)
     f.ego[BLIND] += own[DT]
     if speed > 0.5 * late:
         f.ego[BLIND] = 0.0
-        for c in range(3):
-            f.ego[COURSE + c] = (own[MOTION + c] + own[BY_FIXES + c]) / (own[DT] * speed)
+        store(f.ego[COURSE:], 0, scale(u, 1.0 / speed))
     f.ego[SPEED_OF_LATE] = max(speed, late)
 
 
@@ -370,8 +376,7 @@ def slip(f: Filter, model: Model, own: Floats) -> None:
     rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
     variance = rate * own[DT] ** 2
     if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
-        fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
-        variance += min(rate * UNSEEN**2, fix + f.ego[SHOWN] ** 2)
+        variance += min(rate * UNSEEN**2, sum(vector_at(own, FIX_VARIANCE // 3)) + f.ego[SHOWN] ** 2)
     widen(f.g, 0, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
     for c in range(3):
         for d in range(3):
@@ -406,10 +411,8 @@ def surprised(f: Filter, fails: bool) -> bool:
 def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> float:
     """Probability of a slip, after both tries of a step, by that before it, or by the evidence of an odometry that
     `fails`; once that is known, it does not end by itself."""
-    stays, begins = (
-        1.0 if known else math.exp(-dt / SLIP_LASTS),
-        min(dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5),
-    )
+    stays = 1.0 if known else math.exp(-dt / SLIP_LASTS)
+    begins = min(dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)
@@ -443,7 +446,7 @@ def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints, cou
 def moved(f: Filter, own: Floats) -> None:
     """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts; and
     where it would be, had it not left."""
-    q = own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    q = sum(vector_at(own, MOTION_VARIANCE // 3))
     f.ego[MADE] += q
     more, f.ego[WHOLE] = max(ego_variance(f) - f.ego[WHOLE], q), ego_variance(f)
     if f.ego[NOW] > 0.0:  # where odometry alone leads
@@ -456,17 +459,17 @@ def moved(f: Filter, own: Floats) -> None:
 
 @part
 def corrected(f: Filter) -> None:
-    """After an update of the ego: D (P+ / P-)^2."""
+    """After an update of the ego: D (P+ / P-)^2, and so what it is more uncertain by than P."""
     p, before = ego_variance(f), f.ego[WHOLE]
-    f.ego[MADE] = min(f.ego[MADE] * (p / before) ** 2, p) if before > 0.0 else 0.0
+    left = (p / before) ** 2 if before > 0.0 else 0.0
+    f.ego[MADE], f.ego[UNSAID] = min(f.ego[MADE] * left, p), f.ego[UNSAID] * left
     f.ego[WHOLE] = p
 
 
 @part
 def ego_variance(f: Filter) -> float:
     """m^2, of the three axes together."""
-    answer: float = f.g.p[0, 0] + f.g.p[1, 1] + f.g.p[2, 2]
-    return answer
+    return float(f.g.p[0, 0] + f.g.p[1, 1] + f.g.p[2, 2])
 
 
 @part
@@ -503,13 +506,21 @@ def learn_relative(f: Filter, c: int) -> None:
 
 @part
 def adapt(f: Filter, model: Model) -> None:
-    """Move the levels by what this step has shown."""
+    """Move the levels by what this step has shown, and count by how much the ego's variance would differ, had they
+    been the same ever since: what is not made by motion, by fixes and messages alike. What errors of fixes that are
+    states make follows no level."""
     if model.forget == 0.0:
         return
-    keep = math.exp(-f.ego[SPAN] / model.forget)
+    keep, changes = math.exp(-f.ego[SPAN] / model.forget), f.few[0]
     for kind in range(KINDS_OF_NUMBERS):
         change = f.ego[SLOPE + kind] / (f.ego[INFORMATION + kind] + PRIOR)
         level = f.ego[LEVEL + kind] + min(max(change, -MAX_LEVEL_CHANGE), MAX_LEVEL_CHANGE)
-        f.ego[LEVEL + kind] = min(max(level, MIN_LEVEL), MAX_LEVEL)
+        level = min(max(level, MIN_LEVEL), MAX_LEVEL)
+        changes[kind], f.ego[LEVEL + kind] = math.exp(level - f.ego[LEVEL + kind]) - 1.0, level
         f.ego[SLOPE + kind] = 0.0
         f.ego[INFORMATION + kind] *= keep
+    if has(f.g, 0, ERROR) or has(f.g, 0, COMMON):
+        return
+    others, rest = heard(f, True), max(f.ego[WHOLE] + f.ego[UNSAID] - f.ego[MADE], 0.0)
+    rest *= (changes[FIXES] + others * changes[MESSAGES]) / (1.0 + others)
+    f.ego[UNSAID] += f.ego[MADE] * changes[MOTIONS] + rest

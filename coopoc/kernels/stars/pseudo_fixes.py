@@ -33,7 +33,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
-from ..compiling.vectors import LANES, choose, take
+from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import FIX_GATE, distance, gate_fix, inflation
 from ..geometry import Numbers, completed, direction, metres, spread, vector
 from .gated import gate_components, inflated
@@ -227,10 +227,9 @@ def trace(a: Numbers) -> float:
 
 
 @inside
-def own_cov(fusion: Fusion) -> Numbers:
+def own_cov(fusion: Fusion) -> Lanes:
     """Covariance m^2 of the ego's prediction."""
-    answer: tuple[float, ...] = add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
-    return answer
+    return add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
 
 
 @inside
@@ -261,7 +260,7 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
 
 @inner
-def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
+def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> Lanes:
     """w of least trace in [MIN_OWN_WEIGHT, MAX_WEIGHT], or 1."""
     low, high, going = 0.0 * w + MIN_OWN_WEIGHT, 0.0 * w + MAX_WEIGHT, 0.0 * w + 1.0
     w = choose(w - MAX_WEIGHT, high, w)
@@ -276,8 +275,7 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         going = choose(abs(w - before) - STEP_TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    answer: float = choose(w - MAX_WEIGHT + STEP_TOLERANCE, 0.0 * w + 1.0, w)
-    return answer
+    return choose(w - MAX_WEIGHT + STEP_TOLERANCE, 0.0 * w + 1.0, w)
 
 
 @inner
@@ -295,14 +293,13 @@ def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float
 
 
 @inside
-def product(a: Numbers, b: Numbers) -> Numbers:
+def product(a: Numbers, b: Numbers) -> Lanes:
     """A B."""
-    answer: tuple[float, ...] = negate(minus_product(a, b))
-    return answer
+    return negate(minus_product(a, b))
 
 
 @inside
-def cov_of(polar: Numbers, measured: Numbers, least: float) -> Numbers:
+def cov_of(polar: Numbers, measured: Numbers, least: float) -> Lanes:
     """Covariance m^2 of a converted measurement at a geometry; standard deviations count as 1e3 at most, so that a
     missing component has a variance beyond any other."""
     std = -max(-measured[5], -1e3), -max(-measured[6], -1e3), -max(-measured[7], -1e3)
