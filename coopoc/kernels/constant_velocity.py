@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import Floats
 from .compiling.compile import compiled
 
-BANK = 0.02 * 1.6 ** np.arange(12)
+BANK = 0.02 * 1.6 ** np.arange(16)
 """w, from a straight road at a steady speed to fixes that hardly depend on each other."""
 FIRST_FILTER = 6
 """Which of them holds before anything was seen."""

@@ -351,6 +351,8 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
 def lag_of_fixes(c: Check, column: int) -> float:
     """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move, else 0."""
     rec, truth, misses = c.world, c.log.truth, dict[int, float]()
+    if truth is None and rec.sensors.velocity_reading == "fixes":  # it comes of the fixes, whenever they are
+        return 0.0
     velocity = plane(rec.velocity[0, :, column])
     path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
     path = path if truth is None else plane(truth.position[:, column])

@@ -9,7 +9,7 @@ import pandas as pd
 
 from coopoc import InputError, Sensors
 from coopoc.arrays import Bools, Floats, Ints, checked
-from coopoc.kernels.constant_velocity import BANK, constant_velocity
+from coopoc.kernels.constant_velocity import BANK, REMEMBERS, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
@@ -25,7 +25,7 @@ from .heading import (
     mirrored,
     unknown,
 )
-from .units import Rows, Summary, in_group, only, place, stated_std
+from .units import Rows, Summary, in_group, only, place
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
@@ -178,7 +178,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = Course(unknown if body else heading_at(measured, None, np.inf))
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still)
-    std = stated_std(rows, "x", "y")
+    std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
     shown = velocity_of_fixes(way, steps)
     if arm is not None:
@@ -366,7 +366,10 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     )
     sure, order = np.isfinite(growth), np.arange(len(growth))
     since = order - np.maximum.accumulate(np.where(sure, 0, order))
-    wanders = float(variance * np.median(growth[sure]) / interval) if sure.any() else 0.0
+    begun = since > 1  # two fixes show no change
+    learned = begun & (fixes.t > fixes.t[0] + REMEMBERS)
+    grown = (growth * np.maximum(proved, variance))[learned if learned.any() else begun]
+    wanders = float(grown.mean() / interval) if len(grown) else 0.0
     certain = (since > 3) | (sure & (spread * longest**2 < 2.0))
     return Shown(Signal(fixes.t, velocity), certain, wanders, np.sqrt(proved * spread))
 
