@@ -69,7 +69,7 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
         x: (R, T, E, 3) m.
         cov: (R, T, E, 3, 3) m^2, or of no length.
         columns: (E,) of the vehicles.
-        fix: (E, 2, 3) m^2, variances of a fix, what is white and what lasts.
+        fix: (T, N, 2, 3) m^2, variances of a fix, what is white and what lasts.
         every: steps from one fix to the next, at least.
         marks: (3, E, T) out, 1 where fixes are far, or else contradict covariances.
     """
@@ -87,12 +87,17 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
                 for c in range(3):
                     gap = gnss[run, now, columns[k], c] - x[run, now, k, c]
                     own = cov[run, now, k, c, c] if len(cov) > 0 else 0.0
-                    r[c], p[c], q = r[c] + gap, p[c] + own, q + gap * gap / (fix[k, 0, c] + fix[k, 1, c] + own)
+                    white, lasts = fix[now, columns[k], 0, c], fix[now, columns[k], 1, c]
+                    r[c], p[c], q = (
+                        r[c] + gap,
+                        p[c] + own + white / TOGETHER + lasts,
+                        q + gap * gap / (white + lasts + own),
+                    )
                 count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / TOGETHER
                 if count < TOGETHER:
                     continue
                 for c in range(3):
-                    square += r[c] * r[c] / (TOGETHER * (p[c] + fix[k, 0, c] + TOGETHER * fix[k, 1, c]))
+                    square += r[c] * r[c] / (TOGETHER * p[c])
                     r[c] = p[c] = 0.0
                 worst[run, k] = max(worst[run, k], mean, square)
                 kind = int(far < TOGETHER)
@@ -124,12 +129,12 @@ def mark_odometers(
         motion: variances of a velocity: relative, what of that lasts, and least (m/s)^2.
         dt: s.
     """
-    e, last = np.zeros(3), np.zeros(3)
+    now, last = np.zeros((2, 3)), np.zeros((2, 3))  # means, and their variances
     for run in range(len(gnss)):
         for k in range(len(columns)):
             count, first, begin, after, square, old = 0, 0, -1, 0, 0.0, 0.0
             moved = np.zeros(3)
-            e[:] = 0.0
+            now[:] = 0.0
             for t in range(gnss.shape[1] if doubtful[run, k] > DOUBT / 3.0 else 0):
                 z, u, slip = gnss[run, t, columns[k]], velocity[run, t, columns[k]], 0.0
                 for c in range(3 if t > 0 else 0):
@@ -138,13 +143,14 @@ def mark_odometers(
                     continue
                 first, count, after, steps = t if count == 0 else first, count + 1, t + every, t - begin
                 for c in range(3):
-                    e[c] += (z[c] - moved[c]) / TOGETHER
+                    now[0, c] += (z[c] - moved[c]) / TOGETHER
+                    now[1, c] += (fix[t, columns[k], 0, c] / TOGETHER + fix[t, columns[k], 1, c]) / TOGETHER
                 if count < TOGETHER:
                     continue
                 walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
                 for c in range(3):
-                    slip += (e[c] - last[c]) ** 2 / (2.0 * (fix[k, 0, c] / TOGETHER + fix[k, 1, c]) + walk)
-                    last[c], e[c] = e[c], 0.0
+                    slip += (now[0, c] - last[0, c]) ** 2 / (now[1, c] + last[1, c] + walk)
+                last[:], now[:] = now, 0.0
                 for i in range(max(begin, 0), t + 1 if begin >= 0 and slip > DOUBT else 0):
                     marks[2, k, i] = 1
                 begin, count, square, old = first, 0, 0.0, square
@@ -172,7 +178,7 @@ def mark_neighbours(
         cov: (R, T, 3, 3) m^2.
         neighbours: (R, M, 3) m, estimates by link of the ego.
         links: (M, 3) in time order: index among all L, step and neighbour of each.
-        fix: (2, 3) m^2, variances of a fix, what is white and what lasts.
+        fix: as of `mark_estimates`.
         std: (3,) m, rad, rad.
         every: steps from one to the next, at least.
         marks: (2, N, T) out, 1 where they are far: messages, relative measurements.
@@ -186,13 +192,13 @@ def mark_neighbours(
                 continue
             d, a, b = relative[run, link]
             polar, p, message = direction(dx, dy, dz), cov[run, t], 0.0
-            measured, own = with_std(five(d, a, b), std), (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + fix[1].mean()
+            measured, own = with_std(five(d, a, b), std), (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + fix[t, j, 1].mean()
             gap, reach = residuals(measured, polar), polar[0] * polar[3]
             q = gap[0] ** 2 / (measured[5] ** 2 + own) + (gap[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
             q += (gap[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
             own += std[0] ** 2 + (polar[0] * std[1]) ** 2
             for c in range(3):
-                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[0, c] + fix[1, c] + own)
+                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[t, j, 0, c] + fix[t, j, 1, c] + own)
             counts[j, 2] = t if counts[j, 1] == 0 else counts[j, 2]
             counts[j, 0], counts[j, 1] = t + every, counts[j, 1] + 1
             counts[j, 3] += message > HARD_REJECT_FACTOR * FIX_GATE

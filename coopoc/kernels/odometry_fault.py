@@ -192,7 +192,7 @@ def correct_drives(
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle, which begins anew.
         fresh: of `new_state`.
-        variance: (N, 3) m^2 of a fix.
+        variance: (T, N, 3) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
         out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
@@ -213,7 +213,7 @@ def correct_drives(
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)
-                r = 0.5 * (variance[n, 0] + variance[n, 1])
+                r = 0.5 * (variance[t, n, 0] + variance[t, n, 1])
                 extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
                 if len(out):

@@ -45,7 +45,7 @@ class SoloMeasurements(NamedTuple):
         gnss: (R, T, N, 3) m, NaN for no fix and for an absent vehicle.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle.
         process: (R, T, E, 3) m^2, variance of a step's motion.
-        fixes: (E, 3) m^2, variance of a fix.
+        fixes: (T, E, 3) m^2, variance of a fix.
         columns: (E,) of the vehicles.
         dt: s.
     """
@@ -167,7 +167,7 @@ def filter_runs(
             for e in range(len(measurements.columns)):
                 n, at = measurements.columns[e], index[e]
                 u, q = measurements.velocity[run, t, n], three(measurements.process[run, t, e])
-                fix, r = three(measurements.gnss[run, t, n]), three(measurements.fixes[e])
+                fix, r = three(measurements.gnss[run, t, n]), three(measurements.fixes[t, e])
                 moved = measurements.dt * u[0], measurements.dt * u[1], measurements.dt * u[2]
                 gated = gate_fix(states[e], moved, q, fix, r, gate if t > 0 else 0.0)
                 for c in range(3):

@@ -66,7 +66,7 @@ def doubts(
     every, marks = max(min(round(SECOND / recording.dt), steps // TOGETHER), 1), np.zeros((3, len(egos), steps), int)
     turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
     motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
-    fixes = np.stack([recording.fix_scale[egos] ** 2 * fix[0], np.tile(fix[1], (len(egos), 1))], axis=1)
+    fixes = np.stack(np.broadcast_arrays(recording.fix_scale**2 * fix[0], fix[1]), axis=2)
     doubtful = mark_estimates(recording.gnss, x, claimed, egos, fixes, every, marks)
     doubtful += DOUBT * (neighbours is not None)
     if recording.body is None:
@@ -87,7 +87,7 @@ def doubts(
             rows = np.stack([own, links.step[own], links.neighbour[own]], axis=1)
             std = np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std])
             star = recording.gnss, recording.relative, x[:, :, k], claimed[:, :, k], theirs, rows
-            mark_neighbours(*star, fix, std, 2 * every, far)
+            mark_neighbours(*star, fixes, std, 2 * every, far)
             for kind, j in np.argwhere(far.any(axis=2)).tolist():
                 add(NEIGHBOURS[kind], far[kind, j], ego, j)
     return tuple(notes)

@@ -41,7 +41,7 @@ class GNSS(Alone):
         newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)
         x, missing = np.take_along_axis(fixes, newest, axis=1), 100 * (1 - there.mean())
         notes = (f"holds the last fix where there is none: {missing:.0f} % of the steps",) if missing else ()
-        variance = np.square(recording.sensors.gnss_std * recording.fix_scale[columns])
+        variance = np.square(recording.sensors.gnss_std * recording.fix_scale[:, columns])
         variance = np.broadcast_to(variance, x.shape)
         return solo_track(recording, columns, x, variance, began, notes)
 
@@ -173,12 +173,12 @@ def solo_filter(
     columns = np.asarray(columns)
     shape = *gnss.shape[:2], len(columns), 3
     first = int(x0 is not None)
-    scale: Floats = np.ones((1, 1))
+    scale: Floats = np.ones((1, 1, 1))
     if isinstance(noise, MotionNoise):
         process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
     else:
         process, scale = noise.process_variance(recording, columns, first=first), noise.fix_scale(recording)
-    variance = np.broadcast_to(scale**2 * fixes.variance, gnss.shape[2:])[columns]
+    variance = np.broadcast_to(scale**2 * fixes.variance, gnss.shape[1:])[:, columns]
     inputs = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), variance, columns, recording.dt)
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")

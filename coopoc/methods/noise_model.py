@@ -153,11 +153,12 @@ class NoiseModel:
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
-        return self.gnss_variance[None, None, None] * self.fix_scale(recording) ** 2
+        return (self.gnss_variance * self.fix_scale(recording) ** 2)[None]
 
     def fix_scale(self, recording: Recording) -> Floats:
-        """(N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
-        return np.ones((1, 1)) if self.sensors is None else recording.fix_scale
+        """(T, N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
+        plain = self.sensors is None or not recording.fix_factor.size
+        return np.ones((1, 1, 1)) if plain else recording.fix_scale
 
     @property
     def gnss_variance(self) -> Floats:

@@ -1,7 +1,7 @@
 """Recording: all that vehicles may see of a drive, in R noise realisations. It holds no truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -88,7 +88,7 @@ class Recording:
             count from the observer's heading; None for a recording in the world frame.
         landmarks: columns of members that stand at their `gnss`, which is known exactly; they need no message, and
             links to them count in no budget.
-        fix_factor: (N,) by which the deviations of each one's fixes are larger than `sensors` says; none: all are 1.
+        fix_factor: (T, N) by which the deviation of each fix is larger than `sensors` says; none: all are 1.
 
     Raises:
         InputError: arrays of other shapes or kinds, links of steps or columns that are not there, more of them than
@@ -109,7 +109,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     body: Body | None = None
     landmarks: tuple[int, ...] = ()
-    fix_factor: tuple[float, ...] = ()
+    fix_factor: Floats = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
@@ -133,11 +133,11 @@ class Recording:
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
         if self.body is not None:
             instance("body", self.body, Body).check(self.velocity)
-        stated = len(ids) if plain(self.fix_factor).size else 0
-        factor = checked("fix_factor", self.fix_factor, "(N,) or (0,)", (stated,))
+        shape = gnss.shape[1:3] if plain(self.fix_factor).size else (0,)
+        factor = checked("fix_factor", self.fix_factor, "(T, N) or (0,)", shape)
         wrong, allowed = ~((factor > 0) & (factor < np.inf)), "must be > 0 and finite"
         refuse("fix_factor", factor, wrong, allowed, "1 is as `sensors` says.")
-        self.__dict__["fix_factor"] = tuple(factor.tolist())
+        self.__dict__["fix_factor"] = factor
         self.sensors.check_assumed()
         self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))
 
@@ -148,8 +148,8 @@ class Recording:
 
     @property
     def fix_scale(self) -> Floats:
-        """(N, 1) `fix_factor`, or ones."""
-        return np.array(self.fix_factor or [1.0] * len(self.ids))[:, None]
+        """(T, N, 1) `fix_factor`, or ones."""
+        return np.broadcast_to(self.fix_factor if self.fix_factor.size else 1.0, self.gnss.shape[1:3])[..., None]
 
     @property
     def measured(self) -> bool:
@@ -205,6 +205,7 @@ class Recording:
             broadcasts=self.broadcasts[start:stop],
             arrival=np.where((arrival >= 0) & (arrival < stop), arrival - start, -1),
             body=body and Body(body.yaw_rate[:, start:stop], body.heading[:, start:stop]),
+            fix_factor=self.fix_factor[start:stop],
         )
 
     def stretches(self, vehicle: int | str, shortest: int = 2, fixed: bool = True) -> tuple[tuple[int, int], ...]:

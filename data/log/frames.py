@@ -9,7 +9,7 @@ import pandas as pd
 import pymap3d
 
 from coopoc import InputError, Sensors
-from coopoc.arrays import Bools
+from coopoc.arrays import Bools, Floats
 from coopoc.world.fleet import columns
 from coopoc.world.links import wrap
 
@@ -17,7 +17,7 @@ from ..assemble import PLANE_STD
 from .units import ANGLES, KINDS, Rows, Summary, in_group, only, place, stated_std
 
 if TYPE_CHECKING:
-    from .motion import Member
+    from .motion import Member, Steps
 
 UNSTATED = "standard deviations of {}: none was logged"
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
@@ -219,13 +219,14 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
     return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
 
 
-def fix_factors(rows: Rows, ids: Sequence[str]) -> tuple[float, ...]:
-    """(N,) by which the fixes of each member err more than those of all, in the root mean square of what was logged;
-    none where these are alike."""
+def fix_factors(rows: Rows, ids: Sequence[str], steps: "Steps") -> Floats:
+    """(T, N) by which the fixes of each step and member, or the last before, err more than those of all, in the root
+    mean square of what was logged; none where these are alike."""
     fixes = only(rows, "x", "y")
-    square = np.square(fixes["std"])
-    factor = np.sqrt(square.groupby(fixes["vehicle"]).mean() / square.mean()).reindex(ids).fillna(1.0)
-    return tuple(factor.tolist()) if (np.abs(np.log(factor)) > EQUAL_LOG_FACTOR).any() else ()
+    square, step = np.square(fixes["std"]), steps.nearest(fixes["t"].to_numpy())[0]
+    each = (square / square.mean()).groupby([step, fixes["vehicle"]]).mean().unstack()
+    factor = np.sqrt(each.reindex(range(len(steps.grid)), columns=ids).ffill().bfill().fillna(1.0).to_numpy())
+    return factor if (np.abs(np.log(factor)) > EQUAL_LOG_FACTOR).any() else np.empty(0)
 
 
 def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:

@@ -115,7 +115,7 @@ def window(
         fix_std = np.array(recording.sensors.gnss_std) * recording.fix_scale
         motion_std = recording.sensors.motion_std(recording.velocity[[run]], recording.dt)[0]
     else:
-        sensors, fix_std = noise.sensors, np.sqrt(noise.fix_variance(recording)[0, 0])
+        sensors, fix_std = noise.sensors, np.sqrt(noise.fix_variance(recording)[0])
         motion_std = np.sqrt(np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)[run])
     first, links = step - length + 1, recording.links
     link = links.of(column)
