@@ -77,6 +77,11 @@ def test_the_filter_is_near_one_that_knows_the_faults(tmp_path, seed):
         assert errors[0] < 1.3 * errors[1]
 
 
+def test_wheels_that_spin_lead_no_smoother_astray(tmp_path):
+    log = load_log(str(strange(tmp_path / "log", "car", 3, seconds=90, wheels={"car2": 0.9})))
+    assert co.rt_le(co.BatchSmoother()(log.recording, log.recording.ids), log.truth).max() < 5.0
+
+
 @pytest.mark.parametrize(
     ("kind", "hidden"), [("drone", []), ("car", []), ("car", ["heading", "heading_std"]), ("robot", [])]
 )

@@ -16,6 +16,7 @@ from .doubts import doubts
 from .gaps import in_stretches
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
+from .odometry_fault import with_odometry
 from .track import Checked, Track
 
 if TYPE_CHECKING:
@@ -70,6 +71,8 @@ class BatchSmoother(Checked):
         began, columns = clock(), check_recording(recording).columns(egos)
         model, active = resolve(self.noise_model, recording), located(recording)
         counts, robust, lost = counted(recording, active), self.robust and model.exact_relative, 0
+        if robust:
+            recording, model = with_odometry(recording, recording.observers, model)
         start, _, noise = solo_filter(recording, range(len(recording.ids)), model, fix_noise(model, robust))
         fix = noise if robust else model.fix_variance(recording)
         stds = [np.sqrt(np.broadcast_to(v, start.shape)) for v in (fix, model.process_variance(recording))]
