@@ -1,4 +1,4 @@
-"""coopoc data list | get | show | check | convert."""
+"""coopoc data list | get | show | check."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -9,7 +9,7 @@ import tyro
 from coopoc import InputError
 
 from .fetch import TIMEOUT, Entry, fetch, public
-from .registry import DATASETS, LOGS, card, convert, in_words, kind_of, list_datasets, load_fleet, load_log
+from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
 
@@ -129,22 +129,9 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     print(f"picture: {out}", file=sys.stderr)
 
 
-def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:
-    """Convert a drive to CSV or Parquet.
-
-    Example: coopoc data convert "fcd.xml?dt=0.1" drive.csv
-
-    Args:
-        source: name or path of the drive, and options.
-        out: file in .csv or .parquet.
-    """
-    print(f"{convert(source, out)!r} written to {out}", file=sys.stderr)
-
-
 COMMANDS: Mapping[str, Callable[..., None]] = {
     "list": list_,
     "get": get,
     "show": show,
     "check": check,
-    "convert": convert_,
 }

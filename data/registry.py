@@ -11,12 +11,11 @@ from typing import Any
 from coopoc import Fleet, InputError
 from coopoc.errors import suggestion, unknown
 from coopoc.plugins import find, in_file, names
-from coopoc.text import given_path
 from coopoc.world.storage import read_recording
 
 from .cells import TABLES
 from .fetch import bring
-from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
+from .fleet_files import read_fcd, read_table, read_tum, tum_files
 from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
@@ -203,26 +202,6 @@ def list_datasets() -> list[dict[str, Any]]:
     """
     columns = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
     return [{column: card(name)[column] for column in columns} for name in DATASETS]
-
-
-def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:
-    """Load a fleet, write it, and return it as it was written.
-
-    Args:
-        name_or_path: as in `load_fleet`.
-        out: .csv or .parquet file.
-        options: of the reader.
-
-    Raises:
-        InputError: as `load_fleet`, or another ending of `out`.
-    """
-    path = given_path(out)
-    if path.suffix not in (".csv", ".parquet"):
-        raise InputError("out", path.name, "must end in .csv or .parquet", "Rename it.")
-    fleet = load_fleet(name_or_path, **options)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_table(fleet, path)
-    return fleet
 
 
 def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:

@@ -8,7 +8,8 @@ from conftest import refused
 from scipy.spatial import cKDTree
 from test_data_generate import script
 
-from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, in_words, list_datasets, load_fleet
+from coopoc.data.fleet_files import write_table
+from coopoc.data.registry import DATASETS, FLEETS, card, detect, in_words, list_datasets, load_fleet
 
 NAMES = ("town10", "town10-clients", "town10-validation", "town04")
 
@@ -93,7 +94,7 @@ def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path):
         detect(tmp_path / "drive.doc")
     with refused(r"options = \['columns'\]: town10 is bundled"):
         load_fleet("town10", columns={})
-    convert("town10-clients", tmp_path / "a.csv")
+    write_table(load_fleet("town10-clients"), tmp_path / "a.csv")
     with refused(r"option = 'colums': .* Did you mean columns\?"):
         load_fleet(tmp_path / "a.csv", colums={})
     with refused("vehicle_lenght"):

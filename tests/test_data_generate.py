@@ -14,7 +14,7 @@ from scipy import signal
 from scipy.spatial import cKDTree
 
 from coopoc import load_fleet
-from coopoc.data.registry import bundled, card, convert
+from coopoc.data.registry import bundled, card
 from coopoc.errors import MissingLibraryError
 from coopoc.study.run import run_study
 
@@ -105,12 +105,10 @@ def test_without_sumo_the_pip_line_is_shown(monkeypatch):
 
 
 @with_sumo
-def test_what_was_made_is_loaded_and_converted(tmp_path):
+def test_what_was_made_is_loaded(tmp_path):
     made = tmp_path / "tiny.parquet"
     make(TINY, measured("Town10HD.xodr").parent, tmp_path)
     fleet = load_fleet(made)
     assert load_fleet(f"{made}?format=table").digest == fleet.digest
-    convert(made, tmp_path / "a.csv")
-    np.testing.assert_array_equal(load_fleet(tmp_path / "a.csv").position, fleet.position)
     settings = {"data": str(made), "method": "kalman", "max_neighbours": "0", "runs": 1}
     assert not run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False).failed

@@ -233,7 +233,7 @@ def clock(t: npt.ArrayLike) -> Floats:
             "t",
             f"steps between {gaps.min():g} and {gaps.max():g} s",
             "must be equally spaced",
-            "Resample first: coopoc data convert --dt 0.1.",
+            "Resample first, as FILE?dt=0.1 does.",
         )
     return times
 
