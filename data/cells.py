@@ -27,15 +27,18 @@ WHOLE = re.compile(r"^(\d+)\.0$")
 COLUMNS = 5000
 """Most columns of a table."""
 USUAL = {
-    "vehicle": "observer robot car agent sender vehicle_id robot_id id name",
-    "partner": "neighbour neighbor to target subject other anchor receiver landmark",
-    "t": "time timestamp stamp seconds datetime utc",
-    "latitude": "lat",
-    "longitude": "lon lng long",
-    "height": "alt altitude",
-    "compass_deg": "bearing course cog track",
-    "speed": "sog",
-    "yaw_rate": "gyro gyr",
+    "vehicle": "vehicle observer robot car agent sender vehicle_id robot_id id name",
+    "partner": "partner neighbour neighbor to target subject other anchor receiver landmark",
+    "t": "t time timestamp stamp seconds datetime utc",
+    "latitude": "latitude lat",
+    "longitude": "longitude lon lng long",
+    "height": "height alt altitude",
+    "compass_deg": "compass bearing course cog track",
+    "speed": "speed sog",
+    "yaw_rate": "yaw_rate yawrate gyro gyr",
+    "heading": "heading yaw hdg",
+    "x": "easting east",
+    "y": "northing north",
 }
 """Words in headers that others give to the columns, in wide tables."""
 
@@ -218,12 +221,12 @@ def named_columns(
 def usual_key(header: str) -> str:
     """Our name of the column that a header of others has, by the words in it; "" for none.
 
-    >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "rank")]
-    ['t', 'latitude', 'compass_deg', '']
+    >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "rank", "UTM_North")]
+    ['t', 'latitude', 'compass_deg', '', 'y']
     """
     found = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
     parts = {header.lower(), *(word.lower() for word in found)}
-    return next((key for key, usual in USUAL.items() if parts & {key, *usual.split()}), "")
+    return next((key for key, usual in USUAL.items() if not parts.isdisjoint(usual.split())), "")
 
 
 def missing_column(

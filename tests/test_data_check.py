@@ -55,16 +55,12 @@ def body_twist(frame: pd.DataFrame) -> pd.DataFrame:
 FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
     "one range of twenty": (lambda f: f.assign(range=outliers(f["range"])), r"[345]\.\d% of the ranges lie beyond 5"),
     "one fix of twenty": (in_fixes, r"car0: [45]\.\d% of the fixes lie beyond 5"),
-    "two metres on every range": (
-        lambda f: f.assign(range=f["range"] + 2),
-        r"ranges of car0 and car1 by \+[12]\.\S* \+- \S* m are off in the median, with 0\.3 m stated",
-    ),
     "stamps without their fraction": (
         lambda f: f.assign(t=np.floor(f["t"])),
         r"\d\d% of what was logged is not used, first of all \d+ repeated rows .*stamp\.sec without nanosec",
     ),
     "a body twist as vx, vy": (body_twist, "car0: vx, vy look like a body-frame velocity"),
-    "easting and northing": (lambda f: f.rename(columns={"x": "y", "y": "x"}), "car0: axes look swapped"),
+    "degrees": (lambda f: f.rename(columns={"x": "y", "y": "x"}).eval("x = 1.6 * x"), "car0: axes look swapped"),
     "a mirrored velocity": (lambda f: f.assign(vy=-f["vy"]), "car0: axes look swapped or mirrored: .* at -?0 deg"),
     "a partner without a place": (
         lambda f: pd.concat([f, f[f["range"].notna()].assign(partner="anchor")]),

@@ -102,6 +102,13 @@ def test_a_mistake_is_named_as_the_page_says(tmp_path, mistake):
     assert error.value.hint
 
 
+def test_files_that_are_named_after_sensors_are_of_no_vehicle(tmp_path):
+    (tmp_path / "gps.csv").write_text("t,x,y\n0,0,0\n1,8,0\n")
+    (tmp_path / "imu.csv").write_text("t,speed,yaw_rate\n0,8,0\n1,8,0\n")
+    with refused("fixes = of gps, not of imu: .* a column vehicle"):
+        co.read_log(tmp_path)
+
+
 def test_all_unknown_kinds_are_named_at_once(tmp_path):
     text = "t,car,kind,value\n0,red,gyro,0.1\n0,red,v2x,1\n0,red,gyro,0.1\n"
     (tmp_path / "log.csv").write_text(text)

@@ -214,7 +214,8 @@ def test_motion_capture_and_radios_of_a_public_bag():
     assert np.isfinite(log.recording.relative[0, :, 0]).sum() > 0.95 * sum(map(len, errors))
 
 
-COVARIANCE = [[f"position_covariance{form.format(at)}" for at in (0, 4, 8)] for form in ("[{}]", "_{}")]
+COVARIANCE = [[f"position_covariance{form.format(at)}" for at in (0, 4, 8)] for form in ("[{}]", "{}")]
+STAMPS = ("header.stamp.sec", "header.stamp.nanosec"), ("field.header.stamp.secs", "field.header.stamp.nsecs")
 
 
 def test_topics_as_tables_are_the_bag(tmp_path):
@@ -225,7 +226,7 @@ def test_topics_as_tables_are_the_bag(tmp_path):
         lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, k].T, 48.14, 11.58, 560.0)
         u = fleet.velocity[:, k]
         yaw, sec = np.arctan2(u[:, 1], u[:, 0]), np.floor(fleet.t + 1e-6).astype(int)
-        stamp = {"header.stamp.sec": sec, "header.stamp.nanosec": np.rint(1e9 * (fleet.t - sec)).astype(int)}
+        stamp = dict(zip(STAMPS[k], (sec, np.rint(1e9 * (fleet.t - sec)).astype(int)), strict=True))
         status = -1 * (np.arange(80) == 40)
         variance = dict(zip(COVARIANCE[k], (k + 1) * np.array([0.25, 0.36, 0]), strict=True))
         turned = {

@@ -19,7 +19,7 @@ from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED
 
 from ..assemble import backward_difference, check_scale, check_size, check_time, covered, interpolate, longest_gap
-from ..bag import STAMP, read_bag
+from ..bag import is_topic, read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
 from ..librsf import is_librsf, read_librsf
@@ -260,7 +260,7 @@ def _recording(
     pairs = (links.step * len(ids) + links.observer)[~to_landmark]
     names = ("gnss", "velocity", "yaw_rate", "compass")
     gnss, velocity, yaw_rate, compass = (stacked(members, name)[None] for name in names)
-    factor = () if body or sensors else fix_factors(rows, ids)
+    factor = np.empty(0) if body or sensors else fix_factors(rows, ids, steps)
     sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
     return Recording(
         ids=ids,
@@ -363,7 +363,7 @@ def _files(path: Path) -> list[Path]:
     every = _every_file(path)
     bare = not any(_is_bag(file) or (file.parent == path and not TRUTH.fullmatch(file.stem)) for file in every)
     bare = bare and any(map(is_log, every))
-    return sorted(file for file in every if bare or file.parent == path or STAMP in headers(file))
+    return sorted(file for file in every if bare or file.parent == path or is_topic(headers(file)))
 
 
 def _check_one_drive(rows: Rows, path: Path) -> None:
@@ -405,9 +405,10 @@ def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
     hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once; where ranges to "
     raise InputError(
         "fixes",
-        "none",
+        f"of {', '.join(sorted(names))}, not of {', '.join(sorted(moving))}" if names else "none",
         "must be there: a position in the local frame starts from one",
-        f'{hint}anchors place it, read frame="body". {summary.unread}'.rstrip(),
+        f'{hint}anchors place it, read frame="body". Where files are named after sensors, give them a column vehicle, '
+        f"or a folder that is named after it. {summary.unread}".rstrip(),
     )
 
 

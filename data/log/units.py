@@ -59,6 +59,7 @@ VAGUE, NONSENSE = 30.0, 50.0
 """Times the usual standard deviation of a vehicle's kind, from which the largest, if it repeats, says that there was no
 measurement (squared, also if it does not), and the least that does, whatever the unit: fixes may be of 2 cm or 5 m."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
+DECIMAL = " Degrees are decimal: scale=latitude:1e-7,longitude:1e-7 of integers, 48.1173 for 4807.04 of NMEA."
 UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
@@ -179,7 +180,7 @@ def check_values(rows: Rows) -> None:
                 f"{place(rows[wrong])}, {column.format(kind=first)}",
                 (repr(cell) if cell else "empty") if actual is partner else f"{cell:.10g}",
                 allowed.format(limit=KINDS[first].limit),
-                hint.format(kinds=others),
+                hint.format(kinds=others) + DECIMAL * (first in ("latitude", "longitude")),
             )
 
 

@@ -99,7 +99,7 @@ def _back(recording: Recording, column: int, x: Floats, cov: Floats) -> Floats:
     white = noise.yaw_rate_std**2 * since
     sure = cov[:count, 3, 3] + white
     best = int(np.argmin(sure))
-    heading = x[best, 3] - turns[best]
+    heading = wrap(x[best, 3] - turns[best])
     drift = np.square(noise.velocity_std(recording.velocity[0, :count, column, :2], noise.velocity_floor)).sum(axis=-1)
     off = np.trace(cov[:count, :2, :2], axis1=1, axis2=2) + recording.dt**2 * np.cumsum(drift)
     off += np.square(way[:count]).sum(axis=1) * (sure[best] + white / 3.0)
