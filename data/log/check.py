@@ -173,9 +173,11 @@ def _axes(c: Check, column: int) -> str:
         return "heights of fixes fall where vz is positive: it counts upwards, so that scale=vz:-1 mends it."
     if not size or abs(np.vdot(driven, moved)) > LEAST_CORRELATION * size:
         return ""
-    both = np.stack([driven, driven.conj()], axis=1)  # degrees that are swapped are of another length, too
+    both = np.stack([driven, driven.conj()], axis=1)  # swapped degrees have other lengths; one axis, both
     (turn, mirror), *_ = np.linalg.lstsq(both, moved)
-    if abs(mirror) > abs(turn) and np.linalg.norm(both @ [turn, mirror]) > LEAST_CORRELATION * np.linalg.norm(moved):
+    if abs(mirror) > 2 * abs(turn) and np.linalg.norm(both @ [turn, mirror]) > LEAST_CORRELATION * np.linalg.norm(
+        moved
+    ):
         return (
             f"axes look swapped or mirrored: fixes move as odometry mirrored at {np.angle(mirror, deg=True) / 2:.0f}"
             " deg from +x. At 45, swap easting and northing, latitude and longitude, or vx and vy; headings clockwise "
