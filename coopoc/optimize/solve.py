@@ -31,6 +31,8 @@ DECREASE = 1e-10
 gain."""
 NEWTON_DECREASE = 1e-8
 """That of a Newton step where Gauss-Newton's step is below the tolerance: 1e-4 standard deviations away."""
+DRAWN_STEPS = 20
+"""From each random place, of problems with constraints."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 COVARIANCE_NODES = 1000
@@ -167,7 +169,8 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
     """The lowest feasible result of a problem with constraints, of the first and those from random places around it;
     the problem's notes are of the minima that were found."""
     starts = islice(scattered(problem, first.x), QUIET_DRAWS)
-    results = [first, *(backend.run(problem, y, options) for y in starts)]
+    few = {**options, "max_iterations": DRAWN_STEPS}
+    results = [first, *(backend.run(problem, y, few) for y in starts)]
     scores = [
         (max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE), problem.cost(each.x)) for each in results
     ]
@@ -175,9 +178,10 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
     least, search = scores[best][1], problem.search
     near = [cost - least for beyond, cost in scores if beyond == FEASIBLE and higher(cost, least)]
     notes = (rival(min(near)),) if min(near, default=np.inf) < RIVAL_COST else ()
-    steps = sum(each.iterations for each in results) - results[best].iterations
+    steps = sum(each.iterations for each in results) - (not best) * first.iterations
     search = search._replace(start="drawn" if best else search.start, iterations=search.iterations + steps, notes=notes)
-    return problem.replace_unchecked(search=search), results[best]
+    result = backend.run(problem, results[best].x, options) if best else first
+    return problem.replace_unchecked(search=search), result
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:
