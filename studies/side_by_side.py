@@ -76,8 +76,7 @@ def _findings(results: Results) -> dict[str, str]:
         pairs = rows[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
         each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
-        online = {pair: v for pair, v in each.items() if pair[0] != "bound" and not smooths([look(pair[0]).label])}
-        ranked = sorted((v, pair) for pair, v in online.items())
+        ranked = sorted((v, (m, n)) for (m, n), v in each.items() if m != "bound" and not smooths([look(m).label]))
         if ranked:
             value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""

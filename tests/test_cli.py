@@ -13,6 +13,8 @@ import pytest
 from shell import python, ran
 from small_runs import ENV
 
+from coopoc.cli import main
+
 COMMAND = [sys.executable, "-m", "coopoc.cli"]
 
 
@@ -122,6 +124,12 @@ def test_a_reader_that_leaves_early_is_no_error(folder, format):
         timeout=60,
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_closed_stdout_is_no_error(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    with pytest.raises(SystemExit, match="0"):
+        main(["list"])
 
 
 def test_the_list_names_what_is_installed(tmp_path):

@@ -30,11 +30,11 @@ def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str,
     if not {*where, value} <= set(results.frame):
         return None
     lists = {name: wanted if isinstance(wanted, list) else [wanted] for name, wanted in where.items()}
-    rows = results.frame.dropna(subset=[value])
+    rows = results.frame.dropna(subset=[value])[[*lists]].astype(object)
+    rows = rows.where(rows.notna(), None)
     for name, wanted in lists.items():
-        rows = rows[rows[name].isin(wanted) | (rows[name].isna() & (None in wanted))]
-    there = {name: {None if v != v else v for v in rows[name].unique()} for name in lists}  # NaN stands for None
-    return {name: [v for v in wanted if v in there[name]] for name, wanted in lists.items()} if len(rows) else None
+        rows = rows[rows[name].isin(wanted)]
+    return {name: [v for v in wanted if v in set(rows[name])] for name, wanted in lists.items()} if len(rows) else None
 
 
 def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:

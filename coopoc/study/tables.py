@@ -246,10 +246,8 @@ def pivot(
         body.append((*labels, *entries))
     missing = int(summary["missing"].sum())
     gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
-    if best and (late := [labels[-1] for labels in of if smooths(labels)]):
-        gone.append(
-            f"{', '.join(map(str, late))}: knows later measurements, or draws random numbers anew, and is not ranked."
-        )
+    if best and any(map(smooths, of)):
+        gone.append("What knows later measurements, or draws random numbers anew, is not ranked.")
     made = Table(
         (*map(words, down), *titles),
         tuple(body),
