@@ -63,7 +63,10 @@ def bundled(name: str) -> Fleet:
 
 
 DATASETS: Mapping[str, Callable[[], Fleet]] = {
-    name: partial(bundled, name) for name in ("town04", "town10", "town10-clients", "town10-validation")
+    "town04": partial(bundled, "town04"),
+    "town10": partial(bundled, "town10"),
+    "town10-clients": partial(bundled, "town10-clients"),
+    "town10-validation": partial(bundled, "town10-validation"),
 }
 """Bundled fleets; the names are written out so that a list of them imports nothing."""
 
