@@ -108,7 +108,6 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
         (motions, replace(body, body=Body(own.yaw_rate, np.pi / 2 - own.heading))),
         (motions, replace(body, body=Body(np.clip(np.rad2deg(own.yaw_rate), -35, 35), own.heading))),
         (motions, replace(body, velocity=3.6 * body.velocity, body=Body(own.yaw_rate, np.nan * own.heading))),
-        ("latency is 20 s, max_age 1 s", observe(town, S2, V2X(2, latency=20.0), observers=[8])),
         ("azimuth_std is 2 rad, which is 115°", replace(world, sensors=replace(S2, azimuth_std=2.0))),
     ]
     for note, recording in wrong:
