@@ -113,3 +113,9 @@ def test_a_fleet_speaks_for_odometries_that_do_not_err():
     assert right < found < without - 0.15 * (without - right)
     found, without = (rms(wrong, town, **priors._asdict())[0] for priors in (ON_ROADS, each))
     assert found < 1.01 * without
+
+
+def test_a_star_whose_fixes_drift_as_stated_is_kept():
+    sensors = replace(S2, gnss_std=(1.1,) * 3, gnss_drift_std=3.3, gnss_drift_time=60.0)
+    recording = observe(co.load_fleet("town10"), sensors, V2X(2), runs=4, observers=[40])
+    assert not CooperativeFilter()(recording, [40]).extras["alone"].any()

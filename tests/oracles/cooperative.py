@@ -300,7 +300,7 @@ class Oracle:
         self.lone, self.state, self.deaf = self.state, before, False
         self.left -= dt
         if np.isfinite(fix).all():
-            r = self.r[t, self.ego] * self.white
+            r = self.r[t, self.ego] * self.white + self.life.own + self.life.common
             star, lone = (min(((fix - at) ** 2 / (r + np.diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
             self.doubts = exp(-dt / 10) * self.doubts + [star - lone, 1]
             self.gather(t)
@@ -729,6 +729,7 @@ class Oracle:
                 continue
             with np.errstate(divide="ignore"):
                 r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
+                r += self.life.own + self.life.common
             gap = message.mean + (t - message.step) * self.dt * message.velocity - place
             q = (np.linalg.norm(gap) - relative[0]) ** 2 / r
             if np.isfinite(relative).all():

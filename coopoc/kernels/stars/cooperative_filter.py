@@ -298,7 +298,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
     doubts[ALONE_FOR] -= own[DT]
     if not math.isnan(own[FIX]):
         keep = math.exp(-own[DT] / MEMORY)
-        doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, own) - gap_to_fix(alone, own)
+        doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, model, own) - gap_to_fix(alone, model, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
         doubts[ALIKE] *= keep
         for i in range(count):

@@ -291,7 +291,7 @@ def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, he
 def off(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) -> float:
     """Squared normalised distance of a place from where a neighbour that is measured whole, or its range, puts the ego,
     FIX_GATE at most and where nothing does."""
-    far2, near2, variance = 0.0, 0.0, 0.0
+    far2, near2, variance = 0.0, 0.0, model.own + model.common
     ranged, turned = model.std[0] ** 2 * math.exp(f.ego[LEVEL]), model.std[1] ** 2 * math.exp(f.ego[LEVEL + 1])
     for c in range(3):
         there = rows[i, SOLO + c] + rows[i, AGE] * rows[i, SPEED + c]

@@ -313,12 +313,12 @@ def new_tries(slots: int, vehicles: int) -> Tries:
 
 
 @part
-def gap_to_fix(f: Filter, own: Floats) -> float:
-    """Squared normalised distance of the answer from the fix, clipped."""
-    square = 0.0
+def gap_to_fix(f: Filter, model: Model, own: Floats) -> float:
+    """Squared normalised distance of the answer from the fix, whose error may last, clipped."""
+    square, lasts = 0.0, model.own + model.common
     for c in range(3):
         gap = own[FIX + c] - f.ego[ANSWER + c]
-        square += gap * gap / (own[FIX_VARIANCE + c] + f.ego[COVARIANCE + 4 * c])
+        square += gap * gap / (own[FIX_VARIANCE + c] + lasts + f.ego[COVARIANCE + 4 * c])
     return min(square, LARGEST_GAP)
 
 
