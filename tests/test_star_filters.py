@@ -22,6 +22,7 @@ from coopoc import (
     NoiseModel,
     Recording,
     Sensors,
+    load_fleet,
     observe,
     stars,
 )
@@ -255,3 +256,17 @@ def test_the_laplacian_filter_equals_filterpy(formation):
                 begin(peer, z, noise, z[4] + np.array([0.0, *z[1:4]]))
             assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
             assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
+
+
+def test_a_range_of_almost_nothing_leaves_covariances_positive():
+    seen = observe(
+        load_fleet("town10").between(0, 100),
+        replace(S2, azimuth_std=0.01, inclination_std=0.01),
+        V2X(6),
+        runs=4,
+        observers=[8],
+    )
+    relative = seen.relative.copy()
+    relative[:, ::7, 0] /= 1e5
+    near = replace(seen, relative=relative)
+    assert np.linalg.eigvalsh(JointFilter()(near, [8]).covariance).min() > 0

@@ -186,7 +186,8 @@ def exact(gap: Numbers, measured: Numbers, least: float) -> tuple[Numbers, Numbe
     longer, turned, raised = residuals(measured, polar)
     d, reach = polar[0], max(polar[0], least)
     a, b, c = 1.0 / measured[5], 1.0 / measured[6], 1.0 / measured[7]
-    side, up = b / max(d * polar[3], 1e-3 * reach), c * d / (reach * reach)
+    flat = max(abs(polar[3]), 1e-3) * reach
+    side, up = b * d * polar[3] / (flat * flat), c * d / (reach * reach)
     return spread(polar, a * a, side * side, up * up), along(polar, a * a * longer, side * b * turned, up * c * raised)
 
 

@@ -427,7 +427,7 @@ class Oracle:
         """What the level of motion makes of the ego's variance, after an update."""
         s, now = self.state, self.own_variance()
         left = (now / s.whole) ** 2
-        s.made, s.unsaid, s.whole = min(s.made * left, now), s.unsaid * left, now
+        s.made, s.unsaid, s.whole = min(s.made * left, now), s.unsaid * min(left, 1), now
 
     def begin(self, t):
         """The first step."""
@@ -503,7 +503,8 @@ class Oracle:
             changes, n = np.exp(s.level - before) - 1, self.trusted()
             if len(self.fix_terms(self.ego)) == 1:
                 fixes = (changes[3] + n * changes[4]) / (1 + n)
-                s.unsaid += s.made * changes[5] + max(s.whole + s.unsaid - s.made, 0.0) * fixes
+                made = min(s.made, s.whole + s.unsaid)
+                s.unsaid += made * changes[5] + (s.whole + s.unsaid - made) * fixes
         s.learned = np.zeros(6)
         s.information = s.information * (exp(-dt / g.forget) if g.forget else 1.0)
 
@@ -874,7 +875,7 @@ class Oracle:
         far = expected[0]
         ground, least = hypot(gap[0], gap[1]), 0.0 if unit else self.known.sensors.min_range  # type: ignore[union-attr]
         reach = max(far, least)
-        flat = max(ground, 1e-3 * reach)
+        flat = max(ground / far, 1e-3) * reach
         rows = np.array(
             [
                 gap / far,

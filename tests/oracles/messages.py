@@ -18,7 +18,7 @@ def slopes(vector: Floats, least: float) -> Floats:
     """Jacobian of range, azimuth and inclination, at least `least` m away and not straight above."""
     (x, y, z), r = vector, np.linalg.norm(vector)
     d = max(r, least)
-    ground = max(np.hypot(x, y), 1e-3 * d)
+    ground = d * max(np.hypot(x, y) / r, 1e-3)
     return np.array(
         [
             vector / r,

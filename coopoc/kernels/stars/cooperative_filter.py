@@ -492,7 +492,7 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
     reach = max(far, model.min_range)
-    flat = max(ground, 1e-3 * reach)
+    flat = max(ground / far, 1e-3) * reach
     h.block[MEASURED], h.block[MEASURED + 1] = d >= 0.0, sa != 0.0 or ca != 0.0
     h.block[MEASURED + 2] = si != 0.0 or ci != 0.0
     w = (

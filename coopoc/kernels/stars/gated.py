@@ -223,7 +223,7 @@ def gate_components(
     ray, side, up = axes(polar)
     longer, turned, raised = residuals(measured, polar)
     reach = max(polar[0], least)
-    flat = max(polar[0] * polar[3], 1e-3 * reach)
+    flat = max(abs(polar[3]), 1e-3) * reach
     a, b, c = std[0], std[1] * flat, std[2] * reach
     cov, moved, f, first = gated_update(cov, zeros(a, ROW), ray, longer, a * a, hits[0])
     cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])

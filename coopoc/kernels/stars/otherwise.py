@@ -459,10 +459,10 @@ def moved(f: Filter, own: Floats) -> None:
 
 @part
 def corrected(f: Filter) -> None:
-    """After an update of the ego: D (P+ / P-)^2, and so what it is more uncertain by than P."""
+    """After an update of the ego: D (P+ / P-)^2, and so what it is more uncertain by than P, unless it began anew."""
     p, before = ego_variance(f), f.ego[WHOLE]
     left = (p / before) ** 2 if before > 0.0 else 0.0
-    f.ego[MADE], f.ego[UNSAID] = min(f.ego[MADE] * left, p), f.ego[UNSAID] * left
+    f.ego[MADE], f.ego[UNSAID] = min(f.ego[MADE] * left, p), f.ego[UNSAID] * min(left, 1.0)
     f.ego[WHOLE] = p
 
 
@@ -521,6 +521,6 @@ def adapt(f: Filter, model: Model) -> None:
         f.ego[INFORMATION + kind] *= keep
     if has(f.g, 0, ERROR) or has(f.g, 0, COMMON):
         return
-    others, rest = heard(f, True), max(f.ego[WHOLE] + f.ego[UNSAID] - f.ego[MADE], 0.0)
-    rest *= (changes[FIXES] + others * changes[MESSAGES]) / (1.0 + others)
-    f.ego[UNSAID] += f.ego[MADE] * changes[MOTIONS] + rest
+    others, whole = heard(f, True), f.ego[WHOLE] + f.ego[UNSAID]
+    made, change = min(f.ego[MADE], whole), (changes[FIXES] + others * changes[MESSAGES]) / (1.0 + others)
+    f.ego[UNSAID] += made * changes[MOTIONS] + (whole - made) * change
