@@ -119,7 +119,7 @@ def federate(
     """
     chosen_net = find("coopoc.nets", model) if isinstance(model, str) else model
     start = chosen_net() if isinstance(chosen_net, type) else chosen_net
-    instance("model", start, Gain, "Give GainNet(), or its name.")
+    instance("model", start, Gain, "Give GainNet(), or its name.")  # type: ignore[type-abstract]
     began, plan = time.perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
     names = _names(clients)
     tolerated = plan.tolerated(names)

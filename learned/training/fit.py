@@ -90,7 +90,7 @@ def fit(
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
     2
     """
-    instance("model", model, Gain, "Give GainNet().")
+    instance("model", model, Gain, "Give GainNet().")  # type: ignore[type-abstract]
     instance("schedule", schedule, Schedule)
     for field, pieces in (
         ("training", training),
