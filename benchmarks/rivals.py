@@ -2,16 +2,15 @@
 
 coopoc benchmark benchmarks/rivals.py:EKF benchmarks/rivals.py:FixedLag --data ~/measured
 
-The state is position, heading error and scale error of the odometry, with the noise that the recording states;
-`fitted` finds their numbers as `coopoc.methods.calibration` does for our filters. `Gated` leaves out fixes beyond a
-Mahalanobis distance of 3.4 (99.7 % of those in the plane), as robot_localization does by its rejection threshold
-(Moore, Stouch, IAS-13, 2014). `FixedLag` is GTSAM's incremental smoother of the last 30 s (Kaess et al., IJRR 31(2),
-2012) with Geman and McClure's kernel.
+The state is position, heading error and scale error of the odometry, with the noise that the recording states.
+`Gated` leaves out fixes beyond a Mahalanobis distance of 3.4 (99.7 % of those in the plane), as robot_localization
+does by its rejection threshold (Moore, Stouch, IAS-13, 2014). `FixedLag` is GTSAM's incremental smoother of the last
+30 s (Kaess et al., IJRR 31(2), 2012) with Geman and McClure's kernel.
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, NamedTuple
 
@@ -19,9 +18,8 @@ import gtsam
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from coopoc import Fleet, NoiseModel, Recording, Track
+from coopoc import NoiseModel, Recording, Track
 from coopoc.arrays import Floats
-from coopoc.methods.calibration import calibrated
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 
@@ -239,50 +237,6 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Calibrated(Rival):
-    """A rival whose numbers can be found on a drive. Stone Soup's filter, which gives the EKF's answers, and the UKF,
-    whose are within 2 % of them, are spared the search."""
-
-    def fitted(self, recording: Recording, truth: Fleet) -> Rival:
-        """The rival with the numbers that cost least on a drive with a truth."""
-        usual = {name: value for name, value in self.known._asdict().items() if 0 < value < np.inf}
-
-        def make(numbers: Mapping[str, float]) -> Rival:
-            return replace(self, known=self.known._replace(**numbers))
-
-        return calibrated(make, usual, recording, truth)[0]
-
-
-@dataclass(frozen=True)
-class Net:
-    """KalmanNet, as it comes with the weights of the paper's world; `fitted` trains it from its start on pieces of a
-    drive, the last fifth of which chooses the weights. The loop is KalmanNet's public one, compiled (learned_gain.py
-    compares the two)."""
-
-    method: Any = None
-    name: str = "KalmanNet"
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
-
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
-        """Track of the egos."""
-        from coopoc.learned import load_method
-
-        track: Track = (self.method or load_method("centralised"))(recording, egos)
-        return track
-
-    def fitted(self, recording: Recording, truth: Fleet) -> "Net":
-        """The net trained on a drive with a truth."""
-        from coopoc.learned import GainNet, Schedule, fit
-        from coopoc.learned.training.drives import MeasuredDrives
-        from coopoc.learned.training.measured import measured_clients
-
-        (own,) = measured_clients(MeasuredDrives(recording, truth, recording.ids))
-        made = fit(GainNet(), own.training, own.validation, Schedule(epochs=1500), long=own.long)
-        return replace(self, method=made.model.method(self.name))
-
-
-@dataclass(frozen=True)
 class Entry:
     """What `coopoc benchmark` calls with a noise model to get a method, for tasks of real roads alone."""
 
@@ -294,9 +248,8 @@ class Entry:
         return self.method
 
 
-EKF = Entry(Calibrated("filterpy EKF", Extended))
-Gated = Entry(Calibrated("filterpy EKF, gated", Extended, Known(gate=3.4)))
+EKF = Entry(Rival("filterpy EKF", Extended))
+Gated = Entry(Rival("filterpy EKF, gated", Extended, Known(gate=3.4)))
 UKF = Entry(Rival("filterpy UKF", Unscented))
 StoneSoup = Entry(Rival("Stone Soup EKF", Soup))
-FixedLag = Entry(Calibrated("GTSAM fixed-lag", Smoother, Known(gate=KERNEL)))
-KalmanNet = Entry(Net())
+FixedLag = Entry(Rival("GTSAM fixed-lag", Smoother, Known(gate=KERNEL)))

@@ -214,12 +214,9 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
-            if own := row.get("calibrated_m"):
-                shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own))
-            rival = usual.get(row["task"], {})
-            for key, word in (("blocks_m", ""), ("calibrated_blocks_m", ", calibrated")):
-                if one != USUAL and len(row.get(key, ())) == len(rival.get(key, "-")):
-                    shown[f"less {USUAL}{word} [m]"] = str(paired_difference(np.array(row[key]), np.array(rival[key])))
+            blocks, rival = row.get("blocks_m", ()), usual.get(row["task"], {}).get("blocks_m", "-")
+            if one != USUAL and len(blocks) == len(rival):
+                shown[f"less {USUAL} [m]"] = str(paired_difference(np.array(blocks), np.array(rival)))
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))

@@ -18,8 +18,9 @@ from coopoc.world.recording import MEASURED
 from .pose_drives import hashed
 from .tasks import blocks_of, located, planar, rounded
 
-CALIBRATION_SHARE, BLOCK_SECONDS = 0.4, 30.0
-"""Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""
+BEGIN_SHARE, BLOCK_SECONDS = 0.4, 30.0
+"""Share of a drive before what is scored, free for training; s of a block, a quarter of the rest at most, over which
+errors are averaged."""
 EVERY, OUTAGE, PERIOD = 10, 30.0, 180.0
 """One fix in so many is kept, and none in the last s of every period of s."""
 ROADS: Mapping[str, tuple[str, ...]] = {
@@ -28,9 +29,8 @@ ROADS: Mapping[str, tuple[str, ...]] = {
     "comma2k19": ("comma2k19",),
 }
 """Task -> files of the measurements and of the truth, or a folder of both."""
-PUBLISHED: Mapping[str, tuple[str, ...]] = {"nclt": ("test.pt", "val.pt"), "nclt-val": ("val.pt",)}
-"""Task of drives that a net was published with -> the file that is scored, with all its fixes and steps, and the one
-that calibrates."""
+PUBLISHED: Mapping[str, tuple[str, ...]] = {"nclt": ("test.pt",), "nclt-val": ("val.pt",)}
+"""Task of drives that a net was published with -> the file, which is scored with all its fixes and steps."""
 EVERY_ROAD = {**ROADS, **PUBLISHED}
 STEP = 0.1
 """s, of comma2k19, whose speeds come every 0.01 s."""
@@ -97,28 +97,20 @@ def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
 
 
 def road_row(task: str, data: Path | None, made: Method) -> Row:
-    """Error of the part that does not calibrate, as the method comes and calibrated on the first part.
+    """Error of the last 60 % of a drive, or of all of published ones.
 
     Args:
         task: that is run.
         data: folder of the data, None for those that were fetched, or a log.
-        made: a method, which is calibrated if it has a method `fitted`.
+        made: a method.
     """
     recording, truth = seen(task, data)
-    start, column = int(CALIBRATION_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
+    start, column = int(BEGIN_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
     files = [located(data, name) for name in roads(data)[task]]
     row = {"task": task, "data": hashed(*files)}
     row |= _scored(made, recording, truth, start)
-    if task in PUBLISHED:
-        first = published(files[1]) if files[1:] else ()
-    else:
-        first = recording.between(0, start), truth.between(0, start)
-    if first and hasattr(made, "fitted"):
-        own = _scored(made.fitted(*first), recording, truth, start)
-        row |= {f"calibrated_{name}": own[name] for name in ("blocks_m", "axis_rms_m", "nees") if name in own}
-        row["calibrated_m"] = own["rt_le_m"]
     return row | {"received_bytes_per_second": 0}
 
 

@@ -1,6 +1,6 @@
 """CooperativeFilter: the filter of a star where receivers, compasses, channels, odometers and senders may be wrong."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -13,12 +13,10 @@ from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
 from ..kernels.stars.cooperative_state import Model
 from ..kernels.stars.messages import FORGOTTEN
-from ..world.fleet import Fleet
 from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import Message
-from .calibration import calibrated, scaled
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
@@ -163,7 +161,6 @@ class CooperativeFilter(Checked):
             ON_ROADS where measurements are not simulated: there errors of odometry are assumed until the whole fleet
             speaks for none, and fixes to err twice as far as is stated, together for a while; STATED where the log says
             how far its odometry errs.
-        calibration: what `fitted` has found, a note of its Tracks.
 
     References:
         Ljung, Soderstrom, Theory and Practice of Recursive Identification, MIT Press, 1983;
@@ -182,7 +179,6 @@ class CooperativeFilter(Checked):
     noise_model: NoiseModel | str = "nominal"
     priors: Priors = Priors()
     name: str = "cooperative-filter"
-    calibration: str = ""
     cooperative, needs_fix = True, False
 
     def __post_init__(self) -> None:
@@ -215,7 +211,7 @@ class CooperativeFilter(Checked):
             columns = recording.observing(egos)
             recording, noise_model = with_odometry(recording, columns, noise_model, priors.fix)
         extra, noise_model = noise_model.extra, replace(noise_model, extra=None)
-        model, notes = model_of(noise_model, priors), [*noise_model.notes, *filter(None, [self.calibration])]
+        model, notes = model_of(noise_model, priors), [*noise_model.notes]
         variance = priors.fix**2 * noise_model.fix_variance(recording)
         sent = fading_memory(recording.gnss, recording.velocity, variance, recording.dt)
         stated = noise_model.compass[1], noise_model.sensors.range_offset_std if noise_model.sensors else 0.0
@@ -254,35 +250,6 @@ class CooperativeFilter(Checked):
             yield Estimate(x, cov.reshape(*x.shape, 3), neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
-
-    @classmethod
-    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> "CooperativeFilter":
-        """The filter calibrated on a drive by itself: factors of the deviations of fixes and motion, and deviations of
-        the errors of heading and scale and how long they last, by `calibration.calibrated`. Its gates stay. Innovations
-        do not show errors that fixes share for longer: without a truth their factor stays, too.
-
-        Args:
-            recording: of a drive, or of the first part of one.
-            truth: of the same vehicles and times, NaN where there is none.
-
-        Raises:
-            InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
-        """
-        sensors = check_recording(recording).sensors
-        priors = on_roads(sensors) if recording.measured else Priors()
-        usual = {name: getattr(priors, name) for name in ("fix", "heading", "scale", "lasts")} | {"motion": 1.0}
-        if truth is None:
-            del usual["fix"]
-
-        def make(numbers: Mapping[str, float]) -> CooperativeFilter:
-            if numbers == usual:
-                return cls()
-            own = dict(numbers)
-            noise_model = NoiseModel.nominal(scaled(sensors, 1.0, own.pop("motion")))
-            return cls(noise_model, priors._replace(**own))
-
-        method, sentence = calibrated(make, usual, recording, truth)
-        return replace(method, calibration=sentence)
 
 
 def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:

@@ -1,6 +1,6 @@
 """Solo methods: the raw fix, and the Kalman filter on position."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +13,7 @@ from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise, own_variances
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..text import short_repr
-from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
-from .calibration import calibrated, scaled
 from .doubts import doubts
 from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
@@ -100,23 +98,6 @@ class Kalman(Alone, Checked):
         """
         noise_model = constant_noise(self.noise_model)
         return FilterStream(motion_noise(noise_model, interval), fix_noise(noise_model, self.robust), x0, history)
-
-    @classmethod
-    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> "Kalman":
-        """The filter with factors of the deviations of fixes and motion calibrated on a drive; without a truth that of
-        the motion alone.
-
-        Raises:
-            InputError: as `calibration.calibrated`.
-        """
-        sensors = check_recording(recording).sensors
-        usual = {"motion": 1.0} | ({} if truth is None else {"fix": 1.0})
-
-        def make(numbers: Mapping[str, float]) -> Kalman:
-            by = numbers.get("fix", 1.0), numbers["motion"]
-            return cls() if numbers == usual else cls(NoiseModel.nominal(scaled(sensors, *by)))
-
-        return calibrated(make, usual, recording, truth)[0]
 
 
 def fix_noise(noise_model: NoiseModel, robust: bool) -> FixNoise:
