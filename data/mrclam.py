@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy
 
 from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
@@ -16,11 +15,11 @@ from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
 
 from .assemble import PLANE_STD, backward_difference, check_size, check_time, interpolate, planar_recording
+from .log.heading import Signal
+from .log.motion import step_means
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
-SUBJECTS = 5
-"""Subjects 1 to 5 are robots, those beyond are landmarks."""
 TURN = 2 * np.pi + 1e-6
 LAGS = np.arange(0.0, 0.525, 0.025)
 """s, that are tried."""
@@ -41,26 +40,27 @@ class MrclamLog:
     """Measurements of N robots, and Vicon's truth.
 
     Args:
-        fleet: Vicon truth on the steps, z = 0, NaN in gaps of Vicon.
-        heading: (T, N) rad, Vicon, unwrapped, NaN in gaps.
+        fleet: Vicon truth on the steps, z = 0, headings unwrapped; NaN in gaps of Vicon.
         speed: (T, N) m/s, wheel odometry averaged over the step that ends at t.
         turn_rate: (T, N) rad/s, as `speed`.
-        others: (M, 5) time s on the fleet's clock, observer, subject (columns), range m, bearing rad in the observer's
-            body frame, of every robot-to-robot measurement.
-        true_others: (M, 2) range m and bearing rad, from Vicon at that time; NaN in gaps.
         landmarks: (L, 3) subject, x m, y m of the landmarks.
-        sightings: (S, 5) time s on the fleet's clock, observer (column), landmark (row of `landmarks`, -1 if it has no
-            position), range m, bearing rad, of every measurement of a landmark.
+        relative: (M, 5) time s on the fleet's clock, observer (column), what it measured (column of a robot, N + row of
+            `landmarks`, -1 if it has no position), range m, bearing rad in the observer's body frame.
+        true: (M, 2) range m and bearing rad, from Vicon at that time; NaN in gaps.
     """
 
     fleet: Fleet
-    heading: Floats
     speed: Floats
     turn_rate: Floats
-    others: Floats
-    true_others: Floats
     landmarks: Floats
-    sightings: Floats
+    relative: Floats
+    true: Floats
+
+    @property
+    def heading(self) -> Floats:
+        """(T, N) rad, Vicon, unwrapped, NaN in gaps."""
+        assert self.fleet.heading is not None
+        return self.fleet.heading
 
     __repr__ = short_repr
 
@@ -104,19 +104,17 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     check_size((end - start) / dt, len(numbers), sum(map(len, truths + wheels)), dt, folder.name)
     t = dt * np.arange(int((end - start) / dt) + 1)
     poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], axis=1)
-    odometry = np.stack([_step_means(a[:, 0] - start, a[:, 1:], t) for a in wheels], axis=1)
+    odometry = np.stack([step_means(Signal(a[:, 0] - start, a[:, 1:]), t) for a in wheels], axis=1)
     file = folder / "Landmark_Groundtruth.dat"
     marks = _read(file, "subject x y x_std y_std")[:, :3] if file.is_file() else np.empty((0, 3))
     table = _measurements(folder, numbers)
     table[:, 0] -= start
-    subject = table[:, 2]
-    others = table[np.isin(subject, numbers)]
-    others[:, 2] = np.searchsorted(numbers, others[:, 2])
-    sightings = table[subject > SUBJECTS]
-    row = {number: k for k, number in enumerate(marks[:, 0].tolist())}
-    sightings[:, 2] = [row.get(number, -1) for number in sightings[:, 2].tolist()]
-    exact = np.stack([interpolate(a[:, 0] - start, a[:, 1:], others[:, 0], max_gap) for a in truths])
-    here, there = (exact[others[:, k].astype(np.int64), np.arange(len(others))] for k in (1, 2))
+    member = {n: k for k, n in enumerate([*numbers, *marks[:, 0].tolist()])}
+    table[:, 2] = [member.get(subject, -1) for subject in table[:, 2].tolist()]
+    exact = [interpolate(a[:, 0] - start, a[:, 1:], table[:, 0], max_gap) for a in truths]
+    at = [np.broadcast_to([x, y, np.nan], (len(table), 3)) for x, y in marks[:, 1:].tolist()]
+    every = np.stack([*exact, *at, np.full((len(table), 3), np.nan)])
+    here, there = (every[table[:, k].astype(np.int64), np.arange(len(table))] for k in (1, 2))
     dx, dy = (there - here)[:, :2].T
     position = np.dstack([poses[..., :2], 0 * poses[..., 0]])
     ids = tuple(f"robot{n}" for n in numbers)
@@ -132,13 +130,11 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     )
     return MrclamLog(
         fleet=fleet,
-        heading=poses[..., 2],
         speed=odometry[..., 0],
         turn_rate=odometry[..., 1],
-        others=others,
-        true_others=np.column_stack([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2])]),
         landmarks=marks,
-        sightings=sightings,
+        relative=table,
+        true=np.column_stack([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2])]),
     )
 
 
@@ -176,15 +172,13 @@ def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
     robots, marks = log.fleet.ids, surveyed(log)
     wheel, turning = (_delayed(log, values, calibration.lag) for values in (log.speed, log.turn_rate))
     forward = _driven(calibration.speed, calibration.slip, wheel, turning)
-    sightings = log.sightings.copy()
-    sightings[sightings[:, 2] >= 0, 2] += len(robots)
     return planar_recording(
         (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
         log.fleet.t,
         forward[..., None] * [1.0, 0.0],
         calibration.turn * turning,
         marks[:, 1:],
-        np.vstack([log.others, sightings]),
+        log.relative,
         calibration.sensors,
         "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
     )
@@ -293,17 +287,8 @@ def grouped(error: Floats, observer: Floats | Ints, t: Floats) -> float:
 
 def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     """Standard deviations m and rad of white noise as informative as the ranges and bearings are."""
-    marks = log.sightings[log.sightings[:, 2] >= 0]
-    paths = np.dstack([log.fleet.position[..., :2], log.heading])  # by Vicon
-    poses = [
-        interpolate(log.fleet.t[there], path[there], marks[:, 0], 2 * log.fleet.dt)
-        for path, there in zip(paths.swapaxes(0, 1), log.fleet.present.T, strict=True)
-    ]
-    own = np.stack(poses)[marks[:, 1].astype(np.int64), np.arange(len(marks))]
-    dx, dy = (log.landmarks[marks[:, 2].astype(np.int64), 1:] - own[:, :2]).T
-    t, observer = np.append(log.others[:, 0], marks[:, 0]), np.append(log.others[:, 1], marks[:, 1])
-    reach = np.append(log.others[:, 3] - log.true_others[:, 0], marks[:, 3] - np.hypot(dx, dy))
-    angle = wrap(np.append(log.others[:, 4] - log.true_others[:, 1], marks[:, 4] - (np.arctan2(dy, dx) - own[:, 2])))
+    t, observer = log.relative[:, :2].T
+    reach, angle = (log.relative[:, 3:] - log.true).T
     used = np.isfinite(reach) & (t >= 0) & (t < until)
     if used.sum() < CALIBRATING_COUNT:
         raise InputError(
@@ -312,16 +297,8 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
             f"must be {CALIBRATING_COUNT} or more",
             "Take longer.",
         )
-    ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, angle))
+    ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, wrap(angle)))
     return ranges, bearings
-
-
-def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
-    """(T, C) mean over the step that ends at each instant: difference of the trapezoidal integral."""
-    integral = scipy.integrate.cumulative_trapezoid(values, t, axis=0, initial=0)
-    on_grid = np.column_stack([np.interp(grid, t, column) for column in integral.T])
-    mean = np.diff(on_grid, axis=0) / np.diff(grid)[:, None]
-    return np.vstack([mean[:1], mean])
 
 
 def _measurements(folder: Path, numbers: list[int]) -> Floats:

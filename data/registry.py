@@ -20,7 +20,7 @@ from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
 from .mrclam import MAX_GAP, read_mrclam
-from .source import AUTO, parted, split, there
+from .source import parted, split, there
 
 FLEETS = Path(__file__).parent / "fleets"
 
@@ -233,11 +233,7 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
             raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
     if not path.exists():
         raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
-    if options.get("offset") != AUTO:
-        return read(path, **options)
-    from .log.offsets import less_offsets
-
-    return less_offsets(read(path, **{**options, "offset": None}))
+    return read(path, **options)
 
 
 def _made(registered: Any, name: str) -> Fleet:

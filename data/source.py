@@ -113,18 +113,15 @@ def _place(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-AUTO, TRUE = "auto", ("false", "true")
-"""The offset of ranges that a log itself shows; words for False and True."""
+TRUE = "false", "true"
+"""Words for False and True."""
 READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
     **dict.fromkeys(("dt", "max_gap", "since", "until", "vehicle_length"), (float, "a number of SI units", "0.1")),
     **dict.fromkeys(("any_scale", "mutual"), (lambda text: bool(TRUE.index(text.lower())), "true or false", "true")),
     "columns": (pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
     "kinds": (pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
-    **dict.fromkeys(("scale", "std"), (partial(pairs, value=float), "name:number pairs", "range:0.001,t:1e-3")),
-    "offset": (
-        lambda text: text if text == AUTO else pairs(text, float),
-        "kind:number or one-other:number pairs, or auto",
-        "range:0.4",
+    **dict.fromkeys(
+        ("scale", "std", "offset"), (partial(pairs, value=float), "name:number pairs", "range:0.001,t:1e-3")
     ),
     "antenna": (
         lambda text: pairs(text, _place) if ":" in text else _place(text),

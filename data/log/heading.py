@@ -233,11 +233,13 @@ def held(signal: Signal, at: Floats) -> Floats:
 
 
 def integral(signal: Signal, at: Floats) -> Floats:
-    """(G, C) integral from the first sample, which holds before it, as the last one does behind it."""
+    """(G, C) integral from the first sample, which holds before it, as the last one does behind it; between two at one
+    time the signal leaps."""
     start = signal.t[0]
     ends = np.append(at, signal.t) - start
     t = np.concatenate([[ends.min() - 1], signal.t - start, [ends.max() + 1]])
-    path = scipy.interpolate.make_interp_spline(t, np.pad(signal.value, ((1, 1), (0, 0)), "edge"), k=1).antiderivative()
+    value = np.pad(signal.value, ((1, 1), (0, 0)), "edge")
+    path = scipy.interpolate.BSpline(np.pad(t, 1, "edge"), value, 1).antiderivative()
     return np.asarray(path(at - start) - path(0.0))
 
 

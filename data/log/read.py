@@ -142,8 +142,7 @@ def read_log(
         ignore: kinds that are left out; topics of a bag.
         scale: kind, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and ms.
         offset: kind, or pair, in its unit here -> what all its measurements, or the pair's ranges, are too large by, as
-            {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; `offsets.less_offsets` finds
-            those of the pairs.
+            {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; the check finds those of pairs.
         std: kind -> standard deviation of all its measurements in its unit (m for degrees of latitude), as
             {"range": 0.15, "latitude": 1.5, "speed_kmh": 0.4}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
