@@ -151,15 +151,14 @@ def test_pictures_show_names_as_text(kind, tmp_path):
         assert shown in re.sub(r"[^\w=]|_", "", plain)
 
 
-def test_a_convoy_in_a_tunnel_is_seen_in_the_picture_of_its_log(tmp_path):
-    """Two lanes of 4 km with 20 s without fixes: lanes are apart, and so are the two parts of each row."""
+def test_lanes_are_apart_in_the_picture_of_a_log(tmp_path):
+    """Two of 4 km, 3.5 m apart."""
     path = tmp_path / f"{'motorway' * 12}.csv"
     rows = [f"{t},car{k},{100 * t},{3.5 * k + t % 2}" for k in range(2) for t in range(40) if not 10 < t < 30]
     path.write_text("\n".join(["t,vehicle,x,y", *rows]))
     figure = draw(check(read_log(path, dt=1.0, max_gap=60)), tmp_path / "a.png")
-    ax, when = figure.axes
+    (ax,) = figure.axes
     assert np.ptp(ax.transData.transform([[0, 0], [0, 3.5]])[:, 1]) > 30, "pixels between lanes"
-    assert [max(np.diff(row.get_xdata())) for row in when.lines] == [20.0] * 2
     assert figure._suptitle.get_window_extent().x0 >= 0
 
 

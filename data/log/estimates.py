@@ -349,28 +349,25 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
 
 
 def lag_of_fixes(c: Check, column: int) -> float:
-    """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move, else 0."""
-    rec, truth, misses = c.world, c.log.truth, dict[int, float]()
+    """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move from one to
+    that LEAST_COUNT later, else 0; of a way that repeats the least."""
+    rec, truth = c.world, c.log.truth
     if truth is None and rec.sensors.velocity_reading == "fixes":  # it comes of the fixes, whenever they are
         return 0.0
-    velocity = plane(rec.velocity[0, :, column])
+    velocity, fixes = plane(rec.velocity[0, :, column]), plane(rec.gnss[0, :, column])
     path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
     path = path if truth is None else plane(truth.position[:, column])
-    fixes, most, every = plane(rec.gnss[0, :, column]), int(LONGEST_LAG / rec.dt), max(round(LAG_STEP / rec.dt), 1)
-    at = np.flatnonzero(np.isfinite(fixes))
-    for steps in range(-(most // every) * every, most + 1, every):
-        then = at[(at >= steps) & (at < len(path) + steps)]
-        off = fixes[then] - path[then - steps]
-        off = off[np.isfinite(off)]
-        if len(off) > len(at) / 2:
-            part = np.arange(len(off)) // LEAST_COUNT
-            mean = (np.bincount(part, off.real) + 1j * np.bincount(part, off.imag)) / np.bincount(part)
-            misses[steps] = float(np.median(np.abs(off - mean[part])))
-    least = min(misses.values(), default=np.inf)
-    if least > min(OUTLYING * c.fix_noise, misses.get(0, 0.0) / 2):
+    there = np.isfinite(fixes)
+    lags = LAG_STEP * np.arange(-LONGEST_LAG // LAG_STEP, LONGEST_LAG // LAG_STEP + 1)
+    moved = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, np.nan, np.nan) for lag in [0.0, *lags])]
+    moved = np.subtract(*(np.stack(moved)[:, part] for part in (slice(LEAST_COUNT, None), slice(-LEAST_COUNT))))
+    off = np.abs(moved[0] - moved[1:])
+    misses = np.where(np.isfinite(off).sum(axis=1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), np.inf)
+    now, least, misses = misses[0], misses.min(), misses[1:]
+    if least > min(OUTLYING * c.fix_noise, now / 2):
         return 0.0
-    first = min((steps for steps, miss in misses.items() if miss < 1.05 * least), key=abs)  # of a way that repeats
-    return min((steps for steps in misses if abs(steps - first) * rec.dt < LONG_LAG), key=misses.__getitem__) * rec.dt
+    near = np.abs(lags - min(lags[misses < 1.2 * least], key=abs)) < LONG_LAG
+    return float(lags[near][misses[near].argmin()])
 
 
 def _beside(off: AnyArray, velocity: AnyArray) -> float:

@@ -1,4 +1,4 @@
-"""Plot of a log: fixes, a filter of each vehicle, what stands, and the truth; below it when each vehicle has fixes."""
+"""Plot of a log: fixes, a filter of each vehicle, what stands, and the truth."""
 
 from pathlib import Path
 from textwrap import fill
@@ -17,7 +17,7 @@ LONG_EXTENT = 5.0
 
 
 def draw(result: Check, path: Path) -> Figure:
-    """Write the picture of a log as PNG (or what the ending says): the plane, and below it the times of fixes.
+    """Write the picture of a log as PNG (or what the ending says).
 
     Args:
         result: of `check`.
@@ -25,25 +25,18 @@ def draw(result: Check, path: Path) -> Figure:
     """
     rec, truth = result.log.recording, result.log.truth
     moving = [rec.ids.index(row["vehicle"]) for row in result.vehicles]
-    rows = 0.5 + 0.14 * len(moving)
-    figure = Figure(figsize=(6.4, 5.2 + rows), dpi=150, layout="constrained")
-    ax, when = figure.subplots(2, 1, height_ratios=(5.2, rows))
-    plot_recording(rec, axes(ax), step=0)
-    for row, k in enumerate(moving):
+    figure = Figure(figsize=(6.4, 5.2), dpi=150, layout="constrained")
+    ax = plot_recording(rec, axes(figure.subplots()), step=0)
+    for k in moving:
         color = COLORS[k % len(COLORS)]
         ax.plot(*result.x[:, k, :2].T, color=color, lw=0.8)
         if truth is not None:
             ax.plot(*truth.position[:, k, :2].T, color=INK, lw=1, ls="--")
-        fixes = rec.t[np.isfinite(rec.gnss[0, :, k, 0])]
-        when.plot(fixes, 0 * fixes + row, "|", ms=5, mew=0.6, color=color)
     ax.plot(*np.delete(rec.gnss[0, 0, :, :2], moving, axis=0).T, "^", color=INK, ms=8)
     x, y = np.ptp(ax.dataLim.get_points(), axis=0)
     if max(x, y) > LONG_EXTENT * min(x, y):
         ax.set(aspect="auto", xlabel="East [m], on a scale of its own")
     words = "fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)"
     figure.suptitle(fill(f"{picture(result.log.summary.name)}: {words}", 72), fontsize=9)
-    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(max(len(moving), 1) - 0.5, -0.5))
-    when.set_yticks(range(len(moving)), [picture(rec.ids[k]) for k in moving], fontsize=7)
-    ax.legend().remove()  # the rows below name the colours
     figure.savefig(path)
     return figure
