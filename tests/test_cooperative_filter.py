@@ -15,7 +15,7 @@ from test_star_filters import CHANNELS, gappy, holed, partial, slow_fixes
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Method, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
-from coopoc.evaluate.metrics import errors, neighbour_rt_le
+from coopoc.evaluate.metrics import errors
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
@@ -417,10 +417,10 @@ def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured():
     there = np.flatnonzero(np.isfinite(fleet.position[..., 0]).all(axis=0))
     moving = replace(fleet.select(there), velocity=np.gradient(fleet.select(there).position, fleet.dt, axis=0))
     seen = observe(moving, S2, V2X(4, radius=60.0, loss=0.35), runs=4, observers=[0, 1, 2])
-    ours, joint = (
-        neighbour_rt_le(method(seen, [0, 1, 2]), seen, moving) for method in (CooperativeFilter(), JointFilter())
-    )
-    assert np.sqrt(np.nanmean(ours**2)) < 1.1 * np.sqrt(np.nanmean(joint**2))
+    links = np.concatenate([seen.links.of(ego) for ego in range(3)])
+    truth = moving.position[seen.links.step[links], seen.links.neighbour[links]]
+    ours, joint = (method(seen, [0, 1, 2]).neighbours - truth for method in (CooperativeFilter(), JointFilter()))
+    assert np.nanmean(ours**2) < 1.1**2 * np.nanmean(joint**2)
 
 
 @pytest.mark.parametrize("seed", [798, 1325, 2588])

@@ -21,7 +21,7 @@ from oracles.solo import filterpys
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, Ints
-from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
+from coopoc.evaluate.metrics import innovation_columns
 from coopoc.evaluate.scores import causal, scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
@@ -229,7 +229,6 @@ TRACK = co.Kalman()(SEEN, ["a"])
 USES: dict[str, Callable[[co.Fleet], Any]] = {
     "rt_le": lambda fleet: co.rt_le(TRACK, fleet),
     "nees": lambda fleet: co.nees(TRACK, fleet),
-    "neighbours": lambda fleet: neighbour_rt_le(TRACK, SEEN, fleet),
     "fitted": lambda fleet: co.NoiseModel.fitted(SEEN, fleet),
     "oracle": lambda fleet: co.Kalman(co.NoiseModel.oracle(S, fleet))(SEEN, ["a"]),
     "bound": lambda fleet: co.posterior_bound(fleet, S, "a", recording=SEEN),
@@ -399,7 +398,7 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table():
 
     each = {"kalman": (0.5, 0, 0), "lkf-sa": (0.5004, 90, 90), "joint": (0.4, 90, 90), "ci": (0.5, 0, 90)}
     rows = [
-        {"method": m, "max_neighbours": k, "noise_model": "nominal", "ego": "a", "run": r, "neighbours_mean": 2.0}
+        {"method": m, "max_neighbours": k, "noise_model": "nominal", "ego": "a", "run": r}
         | {"rt_le_m": e + 0.01 * r, "bytes_per_second": float(b), "sent_bytes_per_second": float(sent)}
         for m, (e, b, sent) in each.items()
         for k in (0, 2)

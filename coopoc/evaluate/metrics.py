@@ -56,25 +56,6 @@ def max_error(track: Track, fleet: Fleet) -> Floats:
     return np.asarray(np.fmax.reduce(errors(track, fleet), axis=1))
 
 
-def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
-    """Error of the egos' estimates of their neighbours, sqrt(mean over links |x_j - truth_j|^2), (R, E) m.
-
-    NaN where an ego has no neighbour or the method does not estimate them.
-    """
-    of_recording(track, recording)
-    fleet.require(recording.ids, recording.t)
-    if track.neighbours is None:
-        return np.full((len(track.x), len(track.egos)), np.nan)
-    own_links = [recording.links.of(ego) for ego in track.egos]
-    links, ends = np.concatenate(own_links), np.cumsum([*map(len, own_links)])
-    truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
-    square = np.square(track.neighbours - truth).sum(axis=-1)
-    parts = np.split(square, ends[:-1], axis=1)
-    with np.errstate(invalid="ignore"):
-        mean = [np.nansum(part, axis=1) / np.isfinite(part).sum(axis=1) for part in parts]
-    return np.asarray(np.sqrt(np.stack(mean, axis=1)))
-
-
 def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     r"""Normalised estimation error squared, $e^\top P^{-1} e$, (R, T, E); its mean is 3 for a consistent filter,
     and 2 in the plane, where every height and its estimate are the same.

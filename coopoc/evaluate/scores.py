@@ -12,7 +12,7 @@ from ..methods.track import Method, Track, far_off
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles
 from .ledger import Kind, Way, of_track
-from .metrics import errors, innovation_columns, max_error, measure, nees, neighbour_rt_le, rt_le, share_of_average
+from .metrics import errors, innovation_columns, max_error, measure, nees, rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
@@ -55,9 +55,9 @@ def scored(
         metric: one more, by its name or "mine.py:NAME"; "" for none.
 
     Returns:
-        Columns (R, E): `neighbours_mean`; RT-LE, largest error and neighbours' error in m; the rates of BYTES;
-        `left_fixes`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of wall time per run and
-        vehicle served; and `error_quantiles_m` (R, E, q) and the column NAME of a metric if some are wanted.
+        Columns (R, E): RT-LE and largest error in m; the rates of BYTES; `left_fixes`, 1 or 0; `nees` and
+        `nees_inside` of a method with a covariance; `seconds` of wall time per run and vehicle served; and
+        `error_quantiles_m` (R, E, q) and the column NAME of a metric if some are wanted.
 
     >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -89,10 +89,8 @@ def scored(
             parts[-1]["nees"] = np.nanmean(each, axis=1)
             squares.append(each.sum(axis=0))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    steps = len(recording.t) if track.absent is None else (~track.absent).sum(axis=0)
-    near = np.array([len(recording.links.of(recording.ids.index(ego))) for ego in egos]) / steps
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
-    more: dict[str, Any] = {"neighbours_mean": near, "seconds": seconds / recording.runs / served}
+    more: dict[str, Any] = {"seconds": seconds / recording.runs / served}
     if squares:
         more["nees_inside"] = share_of_average(np.sum(squares, axis=0) / recording.runs, recording.runs)
     return {**{name: np.broadcast_to(value, columns["left_fixes"].shape) for name, value in more.items()}, **columns}
@@ -130,7 +128,6 @@ def _errors(track: Track, drive: Fleet, recording: Recording, quantiles: int) ->
     columns = {
         "rt_le_m": rt_le(track, drive),
         "max_error_m": max_error(track, drive),
-        "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
     }
     if quantiles:
         error = errors(track, drive)
