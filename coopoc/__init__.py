@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-_STUB = Path(__file__).with_suffix(".pyi").read_text()
+_STUB = Path(__file__).with_suffix(".pyi").read_text("utf-8")
 _HOME = {name: module for module, name in re.findall(r"from (\.\S+) import (\w+)", _STUB)}
 """Public name -> module that defines it, as type checkers see it."""
 

@@ -93,6 +93,11 @@ def check_arrays(made: Any, shapes: Mapping[str, tuple[str, tuple[int, ...]]]) -
             made.__dict__[field.name] = checked(field.name, value, *shapes[field.name])
 
 
+def remade(self: Any) -> tuple[Any, tuple[Any, ...]]:
+    """`__reduce__` of a dataclass of arrays: what is copied or unpickled is made anew, checked and read-only."""
+    return type(self), tuple(getattr(self, field.name) for field in fields(self))
+
+
 def plain(values: object) -> AnyArray:
     """Any value as an array; of dtype object what is none, such as rows of different lengths or masked entries.
 

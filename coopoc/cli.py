@@ -8,7 +8,9 @@ import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import EntryPoint, version
+from io import TextIOWrapper
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
@@ -40,6 +42,8 @@ Exit status: 0 done, 1 some cells failed, 2 usage, 130 interrupted and resumable
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script; exits with the status that the help text names."""
     warnings.formatwarning = lambda message, *_args, **_options: f"coopoc: warning: {message}\n"
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # of a locale that lacks a letter
     sys.exit(_status(list(sys.argv[1:] if argv is None else argv)))
 
 
@@ -164,6 +168,8 @@ def list_names() -> None:
             )
 
 
+NARROWEST = 40
+"""Columns of a terminal for which help is laid out, at least."""
 OWN: Mapping[str, Command] = {
     "run": run,
     "table": table,
@@ -213,6 +219,7 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
         print(_settings(rest[0]))
     if isinstance(loaded, Mapping):
         return _dispatch(loaded, rest, f"{prog} {name}")
+    os.environ["COLUMNS"] = str(max(get_terminal_size().columns, NARROWEST))
     return int(tyro.cli(loaded, prog=f"{prog} {name}", args=rest, config=(FlagCreatePairsOff,)) or 0)
 
 

@@ -92,7 +92,7 @@ def public() -> Mapping[str, Entry]:
     >>> public()["plaza1"].bytes
     2349302
     """
-    written = tomllib.loads(Path(__file__).with_name("public.toml").read_text())
+    written = tomllib.loads(Path(__file__).with_name("public.toml").read_text("utf-8"))
     return {name: _entry(name, **fields) for name, fields in written.items()}
 
 

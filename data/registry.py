@@ -31,7 +31,7 @@ def card(name: str) -> dict[str, Any]:
     >>> card("town10")["neighbours"]["mean"] > 5
     True
     """
-    made: dict[str, Any] = json.loads((FLEETS / f"{name}.json").read_text())
+    made: dict[str, Any] = json.loads((FLEETS / f"{name}.json").read_text("utf-8"))
     return made
 
 

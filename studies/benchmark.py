@@ -107,7 +107,7 @@ def benchmark(
         print(page([made]))
     if table:
         drawn_worlds, cards = (
-            [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))] for folder in (out / "worlds", out)
+            [json.loads(card.read_bytes()) for card in sorted(at.glob("*.json"))] for at in (out / "worlds", out)
         )
         if not cards and not drawn_worlds:
             raise InputError("out", str(out), "holds no card", "Run coopoc benchmark METHOD first.")

@@ -126,6 +126,13 @@ def test_a_reader_that_leaves_early_is_no_error(folder, format):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_neither_an_ascii_locale_nor_a_narrow_terminal_matters(folder):
+    env = ENV | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "COLUMNS": "1"}
+    for words in ("run --help", "report runs/small", "table runs/small --rows cell"):
+        done = ran([*COMMAND, *words.split()], cwd=folder, env=env, timeout=60)
+        assert done.returncode == 0, done.stderr
+
+
 def test_a_closed_stdout_is_no_error(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
     with pytest.raises(SystemExit, match="0"):

@@ -1,5 +1,7 @@
 """Wrong calls of the public functions: each is refused with an error of ours that names the field, or has an answer."""
 
+import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
@@ -139,6 +141,11 @@ def test_a_noun_keeps_no_array_that_its_owner_can_change():
     fleet = replace(FLEET, t=part)
     whole[3] = 99.0
     assert fleet.t[3] == 0.3
+    assert not RECORDING.links.of(0).flags.writeable
+    for noun in (FLEET, RECORDING, TRACK, of_track(TRACK, RECORDING, co.Kalman().message)):
+        for copied in (copy.deepcopy(noun), pickle.loads(pickle.dumps(noun))):
+            for part in (copied, getattr(copied, "links", copied)):
+                assert not any(a.flags.writeable for a in vars(part).values() if isinstance(a, np.ndarray) and a.size)
 
 
 def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL):

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, check_arrays, checked, number, one_of, refuse, texts
+from ..arrays import Floats, check_arrays, checked, number, one_of, refuse, remade, texts
 from ..errors import InputError
 from ..methods.track import Track, of_recording
 from ..text import short_repr
@@ -47,6 +47,7 @@ class Ledger:
     servers: tuple[str, ...] = ()
 
     __repr__ = short_repr
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         for name in ("names", "servers"):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints, check_fields, checked, instance, number, refuse, texts
+from ..arrays import Floats, Ints, check_fields, checked, instance, number, refuse, remade, texts
 from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..text import short_repr
@@ -47,6 +47,7 @@ class NoiseModel:
     extra: Floats | None = None
 
     __repr__ = short_repr
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         check_fields(self)

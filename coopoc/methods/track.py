@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, named, number, refuse, texts
+from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, named, number, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
 from ..world.fleet import columns, same_drive
@@ -67,6 +67,7 @@ class Track:
     absent: Bools | None = None
 
     __repr__ = short_repr
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)

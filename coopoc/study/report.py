@@ -75,8 +75,8 @@ def report(
         sections=sections,
         cards=cards or {},
         environment=environments([section["environment"] for section in sections]),
-        css=Markup((OWN / "report.css").read_text()),
-        script=Markup((OWN / "report.js").read_text()),
+        css=Markup((OWN / "report.css").read_text("utf-8")),
+        script=Markup((OWN / "report.js").read_text("utf-8")),
     )
     store.write(out, page)
     return out

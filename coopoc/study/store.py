@@ -85,7 +85,7 @@ def content(path: Path, fields: Mapping[str, Any], absent: str, hint: str) -> di
     if not path.is_file():
         raise InputError("folder", str(path.parent), absent, hint)
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8")
         document: Any = json.loads(text)
         if "\\ud" in text.lower():
             json.dumps(document, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError

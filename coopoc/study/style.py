@@ -38,7 +38,7 @@ class Panel:
     ticks: Mapping[Any, str] = field(default_factory=dict)
 
 
-DATA = tomllib.loads((Path(__file__).parent / "style.toml").read_text())
+DATA = tomllib.loads((Path(__file__).parent / "style.toml").read_text("utf-8"))
 METHODS = {name: Look(*each) for name, each in DATA["methods"].items()}
 UNITS = {column: tuple(each) for column, each in DATA["columns"].items()}
 """Column -> (words, unit)."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, check_arrays, check_fields, checked, listed, number
+from ..arrays import Bools, Floats, check_arrays, check_fields, checked, listed, number, remade
 from ..errors import InputError, shown, unknown
 from .long_table import long_table
 from .plausible import MAX_POSITION, MAX_SPEED, headings, plausible
@@ -50,6 +50,8 @@ class Fleet:
     source: str = ""
     licence: str = ""
     heading: Floats | None = None
+
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         self.__dict__["ids"] = names(self.ids)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, number, refuse
+from ..arrays import Bools, Floats, Ints, checked, frozen, number, refuse, remade
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +29,8 @@ class Links:
     step: Ints
     observer: Ints
     neighbour: Ints
+
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         size = -1
@@ -61,7 +63,7 @@ class Links:
         """Links in the order of their observers, and the first of each observer, which spares a search per observer."""
         order = np.argsort(self.observer, kind="stable")
         last = int(self.observer.max(initial=-1))
-        return order, np.searchsorted(self.observer[order], np.arange(last + 2))
+        return frozen(order, int), np.searchsorted(self.observer[order], np.arange(last + 2))
 
     def __len__(self) -> int:
         return len(self.step)

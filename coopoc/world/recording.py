@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, texts
+from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
 from .fleet import clock, columns, interval, names
@@ -39,6 +39,7 @@ class Body:
     heading: Floats
 
     __repr__ = short_repr
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         shape: tuple[int, ...] = (-1, -1, -1)
@@ -110,6 +111,8 @@ class Recording:
     body: Body | None = None
     landmarks: tuple[int, ...] = ()
     fix_factor: Floats = field(default_factory=lambda: np.empty(0))
+
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):

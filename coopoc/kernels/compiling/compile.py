@@ -63,7 +63,7 @@ def storage(function: Function) -> Function:
     return cast(Function, _made(function, set(), inline="always"))
 
 
-USUAL_SECONDS: dict[str, float] = json.loads((Path(__file__).parent / "usual_seconds.json").read_text())
+USUAL_SECONDS: dict[str, float] = json.loads((Path(__file__).parent / "usual_seconds.json").read_text("utf-8"))
 """CPU seconds that a kernel took to compile where `benchmarks/compile.py` was run, of those above a second."""
 QUIET_SECONDS = 2.0
 """s of compiling after which a line on stderr reports it."""
