@@ -161,7 +161,8 @@ def number(
         raise InputError(field, shown(value), f"must be a {word}, {allowed}", hint)
     result = kind(scalar.item())
     if not low <= result <= high:
-        raise InputError(field, value, f"must be {allowed}", hint)
+        most = f" and at most {high:g}" if allowed.startswith(">") and result > high else ""
+        raise InputError(field, value, f"must be {allowed}{most}", hint)
     return result
 
 

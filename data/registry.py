@@ -190,7 +190,7 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
         endings = ".csv, .parquet, .jsonl, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
         raise InputError(
             "data",
-            path.name,
+            str(path),
             f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files",
             f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.",
         )

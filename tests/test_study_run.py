@@ -136,6 +136,8 @@ def test_bad_input_is_named_before_any_work(study, tmp_path):
         run_study(study, tmp_path, settings={"max_neighbours": -1})
     with refused("jobs = 0: must be >= 1"):
         run_study(study, tmp_path, jobs=0)
+    with refused("must be >= 1 and at most 10000"):
+        run_study(study, tmp_path, jobs=10**5)
     with refused(r"study = 'smal'.*Did you mean small\?"):
         run_study("smal", tmp_path)
     (tmp_path / "file").write_text("")

@@ -34,4 +34,4 @@ def load_graph(path: str | Path, repair: bool = False) -> Graph:
     if fetched := find("coopoc.readers", "fetched")(str(path)):
         return load_graph(fetched, repair)
     hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
-    raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)
+    raise InputError("path", str(path), f"must end in {' or '.join(GRAPHS)}", hint)

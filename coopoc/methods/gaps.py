@@ -53,6 +53,7 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
 
 def follow(method: Method, recording: Recording, egos: Vehicles) -> Track:
     """The track of any method across gaps, of one that knows nothing of them, too."""
+    instance("method", method, Method, "Give co.Kalman(), or one as in docs/extend.md.")  # type: ignore[type-abstract]
     return in_stretches(type(method).__call__)(method, recording, egos)
 
 

@@ -10,7 +10,7 @@ import torch
 from coopoc.arrays import Floats, Ints, Limits, check_fields
 
 Epoch = Literal["step", "pass"]
-STEPS, SIZE = (1, 10**7, "> 0 and at most 10^7"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
+STEPS, SIZE = (1, 10**7, "> 0"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
 LIMITS: Limits = {
     **dict.fromkeys(("epochs", "batch", "checks"), STEPS),
     **dict.fromkeys(("learning_rate", "clip"), SIZE),
