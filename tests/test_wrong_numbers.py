@@ -347,6 +347,8 @@ BAD = (header((3, 80, 2, 99)), header((10**11,)), header((2**61,)), b"\x93NUMPY\
 def test_a_file_is_refused_by_its_headers(tmp_path, content, monkeypatch):
     with refused("recording = .*must be a Recording"):
         save_recording(tmp_path / "good.npz", SEEN)  # type: ignore[arg-type]
+    with refused("must end in .npz"):
+        save_recording(SEEN, str(tmp_path))
     save_recording(SEEN, tmp_path / "good.npz", FLEET)
     assert read_recording(tmp_path / "good.npz")[0].runs == 3
     with zipfile.ZipFile(tmp_path / "good.npz") as good, zipfile.ZipFile(tmp_path / "bad.npz", "w") as bad:

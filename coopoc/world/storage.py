@@ -44,9 +44,11 @@ def save_recording(recording: Recording, path: str | Path | IO[bytes], truth: Fl
         truth: of the same vehicles at the same steps.
 
     Raises:
-        InputError: no recording, or a truth of other vehicles or steps.
+        InputError: no recording, a truth of other vehicles or steps, or a path that does not end in .npz.
     """
     instance("recording", recording, Recording)
+    if isinstance(path, str | Path) and given_path(path).suffix != ".npz":
+        raise InputError("path", str(path), "must end in .npz", "NumPy would append it.")
     if truth is not None:
         truth.require(recording.ids, recording.t)
     settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
