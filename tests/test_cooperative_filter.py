@@ -476,3 +476,15 @@ def test_clocks_of_neighbours_are_found(priors):
     assert np.percentile(np.abs(found.extras["clock"][:, known & ~wrong]), 90) < 1e-3
     assert any(note.startswith("clock, ") and note.endswith("ahead, or its messages are late") for note in found.notes)
     assert not any(note.startswith("clock, ") for note in usual.notes)
+
+
+@pytest.mark.parametrize("ego", [8, 40])
+def test_a_receiver_that_errs_from_the_start_is_outvoted_by_neighbours_that_agree(ego):
+    """Law: fixes 24 m off in the whole drive, by little enough that no single one shows it, and neighbours that all
+    contradict them by the same 24 m, none of which was ever trusted: it is the ego's receiver. As equals all were
+    doubted, and three of four draws stayed 24 m off."""
+    fleet, stated = load_fleet("town10").between(0, 300), replace(S2, gnss_std=(5.0,) * 3)
+    acting = replace(S2, gnss_std=(2.5,) * 3)
+    seen = observe(fleet, acting, V2X(3, radius=100.0), runs=4, seed=3, observers=[ego], assumed=stated)
+    track = CooperativeFilter()(moved(seen, slice(None), ego, [19.2, -14.4, 0.0]), [ego])
+    assert errors(track, fleet)[:, 200:].max() < 2.0

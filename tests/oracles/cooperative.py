@@ -215,7 +215,19 @@ class Oracle:
 
     def blank(self) -> SimpleNamespace:
         tables = ("last", "since", "way", "joined", "hits", "mean", "slot", "pace", "locked", "louder", "revoked")
-        numbers = ("made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed", "spread")
+        numbers = (
+            "made",
+            "supported",
+            "shown",
+            "unseen",
+            "blind",
+            "evidence",
+            "driven",
+            "agree",
+            "slips",
+            "speed",
+            "spread",
+        )
         return SimpleNamespace(
             **{name: {} for name in tables},
             **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight", "unsaid"), 0.0),
@@ -496,6 +508,7 @@ class Oracle:
             self.take(t, j)
         if g.fix_gate:
             self.trust()
+            self.doubt_ego()
         self.corrected()
         if g.forget:
             step = np.clip(s.learned / (s.information + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
@@ -658,6 +671,39 @@ class Oracle:
         if ("x", j) in s.belief.names:
             s.belief.drop(("b", j))
             s.belief.add(("b", j), 0.0, TAU**2 + self.life.own)
+
+    def doubt_ego(self):
+        """Where none was ever trusted, but most err alike, the ego errs: it goes where they see it."""
+        s, b = self.state, self.state.belief
+        heard = [j for j in s.members if j in s.last]
+        if len(heard) < 2 or s.trusted != {self.ego} or {*s.revoked} - {self.ego}:
+            return
+
+        def far(j, k=None) -> float:
+            """From one another, or from 0."""
+            at, to = b.at("b", j), b.at("b", j if k is None else k)
+            two, cross = float(k is not None), b.p[at, to]
+            v = b.p[at, at] + two * (b.p[to, to] - cross - cross.T) + 1e-6 * np.eye(3)
+            gap = b.x[at] - two * b.x[to]
+            return float(gap @ np.linalg.solve(v, gap))
+
+        alike = {j: [k for k in heard if k == j or far(j, k) < FIX_GATE] for j in heard}
+        doubtless = [j for j in heard if far(j) > WILD]
+        best = max(doubtless, key=lambda j: len(alike[j]), default=None)
+        if best is None or 2 * len(alike[best]) <= len(heard) or len(alike[best]) < 2:
+            return
+        x, e = b.at("x", self.ego), b.at("b", best)
+        there, spread = b.x[x] + b.x[e], np.trace(b.p[x, x] + b.p[e, e] + 2 * b.p[x, e]) / 3
+        for j in list(s.members):
+            self.dismiss(j, True, False)
+        s.way.clear()
+        s.trusted |= {*alike[best]}
+        for j in alike[best]:
+            s.mean.pop(j, None)
+        self.place(there, spread)
+        self.doubt(self.ego)
+        s.revoked[self.ego] = s.revoked.get(self.ego, 0) + 1
+        s.left, s.agreed, s.hits["fix"] = None, 0.0, 0
 
     def start(self, t, fix: Floats) -> bool:
         """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""

@@ -15,7 +15,7 @@ from ..compiling.small import apply, inner_product, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
-from .cooperative_messages import fix_terms, goes_on, receive, trust, use_fix
+from .cooperative_messages import doubt_ego, fix_terms, goes_on, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -355,6 +355,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
         goes_on(f, rows, f.who[i, ORDER])
     if model.fix_gate > 0.0:
         trust(f, model)
+        doubt_ego(f, model)
     locate(f)
     f.ego[STEPS] += 1
     corrected(f)

@@ -6,10 +6,10 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import add_diagonal, inner_product, scale, store
+from ..compiling.small import add, add_diagonal, inner_product, scale, store, subtract
 from ..dead_reckoning import ROUNDING
-from ..gate import FIX_GATE, PATIENCE, SLIP, count, inflation
-from .cooperative_members import replace_implausible_velocity, stand
+from ..gate import FIX_GATE, NOTHING, PATIENCE, SLIP, count, inflation
+from .cooperative_members import dismiss, replace_implausible_velocity, stand
 from .cooperative_state import (
     AGE,
     AGREED,
@@ -19,8 +19,10 @@ from .cooperative_state import (
     ESTABLISHED,
     EXTRA_VARIANCE,
     FIXES,
+    HITS,
     INPUT,
     LAST,
+    LEFT,
     LEVEL,
     LOCKED,
     MAX_LOCKOUT,
@@ -44,6 +46,7 @@ from .cooperative_state import (
     VEHICLE,
     WAY,
     WHEN,
+    WILD,
     Filter,
     Model,
     heard,
@@ -63,6 +66,7 @@ from .gaussian import (
     VARIANCE,
     add_term,
     begin_rows,
+    clear,
     correct,
     distance,
     expect,
@@ -70,6 +74,7 @@ from .gaussian import (
     insert_from_measurement,
     remove,
     update,
+    widen,
 )
 from .messages import block_at, three_of, vector_at
 from .otherwise import drive, learn_fix, score, turned
@@ -347,3 +352,58 @@ def trust(f: Filter, model: Model) -> None:
         update(g, h)
         if model.own == 0.0:
             remove(g, best, ERROR)
+
+
+@part
+def doubt_ego(f: Filter, model: Model) -> None:
+    """Where the fixes of most neighbours err by one and the same vector beyond doubt, and none has ever been trusted,
+    it is the ego's receiver that errs: the ego goes where they see it, and they join anew."""
+    g, ego, best, most, others = f.g, f.who[0, VEHICLE], ABSENT, 1, heard(f, False)
+    if others < 2 or f.status[ego, TRUSTED] == 0.0:
+        return
+    for j in range(len(f.slot)):
+        if j != ego and (f.status[j, TRUSTED] > 0.0 or f.status[j, REVOKED] > 0.0):
+            return
+    for k in range(1, len(f.who)):
+        alike = 0
+        for i in range(1, len(f.who)):
+            alike += difference(f, k, k) > WILD and (i == k or difference(f, k, i) < FIX_GATE)
+        if alike > most:
+            best, most = k, alike
+    if 2 * most <= others:
+        return
+    first, spread = 3 * g.block[best, ERROR], 0.0
+    for c in range(3):
+        spread += (g.p[c, c] + g.p[first + c, first + c] + 2.0 * g.p[c, first + c]) / 3.0
+    there = add(vector_at(g.x, 0), vector_at(g.x, first // 3))
+    for k in range(1, len(f.who)):
+        f.who[k, HITS] = k == best or difference(f, best, k) < FIX_GATE
+    for k in range(1, len(f.who)):
+        j, agrees = f.who[k, VEHICLE], f.who[k, HITS] > 0
+        if j >= 0:
+            dismiss(f, model, k, False)
+            if agrees:
+                set_trust(f, j, 1.0, model.own)
+    clear(g, 0)
+    store(g.x, 0, there)
+    widen(g, 0, spread)
+    set_trust(f, ego, 0.0, TAU**2 + model.own)
+    f.status[ego, REVOKED] += 1.0
+    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], f.who[0, HITS] = NOTHING, 0.0, 0.0, 0
+
+
+@part
+def difference(f: Filter, k: int, i: int) -> float:
+    """Squared normalised difference of the errors of two members' fixes, infinite where one has sent none; of one error
+    from 0 where they are the same, 0 then."""
+    g, h, two = f.g, f.h, 1.0 if i != k else 0.0
+    for m in (k, i):
+        if f.who[m, VEHICLE] < 0 or f.status[f.who[m, VEHICLE], USED] == -math.inf:
+            return math.inf if i != k else 0.0
+    a, b = 3 * g.block[k, ERROR], 3 * g.block[i, ERROR]
+    for c in range(3):
+        for d in range(3):
+            more = g.p[b + c, b + d] - g.p[a + c, b + d] - g.p[b + c, a + d]
+            h.matrix[SQUARE + 3 * c + d] = g.p[a + c, a + d] + two * more + (1e-6 if c == d else 0.0)
+    gap = subtract(vector_at(g.x, a // 3), scale(vector_at(g.x, b // 3), two))
+    return distance(block_at(h.matrix, SQUARE // 9), gap)[0]
