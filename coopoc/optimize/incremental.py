@@ -1,7 +1,7 @@
 """Live estimation: GTSAM's iSAM2 follows the measurements, and `solve` checks where it has led."""
 
 from collections import ChainMap
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,6 @@ from ..arrays import Floats, checked, instance, number
 from ..errors import InputError, require, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
-from .model.derivatives import linearise
 from .model.factor import Factor, fused, stacked, unchecked
 from .model.problem import Problem, index_of, indices, points, rows, several
 from .solution import Solution
@@ -22,11 +21,6 @@ from .starts.initial import initial_guess
 LOOSE = 1e6
 """m, standard deviation of a prior that iSAM2 alone has on each new point, which one range leaves free: so vague that
 measurements decide wherever the first guess was."""
-STEADY = 100.0
-"""m, that of another one, which a point has as long as measurements know it less than this in some direction, and less
-than a share ROUND of what they know in the best: it damps the steps that nearly parallel ranges would take."""
-ROUND = 1e-3
-"""Share of information."""
 
 
 class Incremental:
@@ -43,7 +37,7 @@ class Incremental:
 
     def __init__(self, problem: Problem, isam: Any, lag: int) -> None:
         self.names, self.isam, self._problem, self._factors = list(problem.names), isam, problem, list(problem.factors)
-        self.lag, self._steps, self._slots, self._steadied = lag, 0, 0, dict[int, tuple[int, Floats]]()
+        self.lag, self._steps, self._slots = lag, 0, 0
         self._place, self._poses = {name: k for k, name in enumerate(self.names)}, {*problem.poses}
         self._step(problem, range(len(self.names)), 0, initial_guess(problem), which_turn(problem), self.names)
 
@@ -128,50 +122,18 @@ class Incremental:
             lost = ", ".join(names[k] for k in free[:5])
             raise InputError("factors", f"leave {lost} free", "must hold every new pose", "Add a relative pose.")
         graph, guess = graph_of(part, stated, keys), values(part.space, turns, x, first)
-        new = {first + int(k) for k in np.flatnonzero(~np.array(turns, dtype=bool))}
-        told, spent = self._told(part, keys, first, x, new), list[int]()
-        late = list[int]()
-        for k, information in told.items():
-            least, *_, most = np.linalg.eigvalsh(information).tolist()
-            if least > min(STEADY**-2, ROUND * most):
-                spent += [self._steadied[k][0]] if k in self._steadied else []
-            elif k in new:
-                late.append(k)
-        for std, eased in ((LOOSE, sorted(new)), (STEADY, late)):
-            for k in eased:
-                noise = gtsam.noiseModel.Isotropic.Sigma(d, std)
-                graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](k, x[k - first, :d], noise))
+        for k in np.flatnonzero(~np.array(turns, dtype=bool)).tolist():
+            vague = gtsam.noiseModel.Isotropic.Sigma(d, LOOSE)
+            graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](first + k, x[k, :d], vague))
         used = [dict.fromkeys([*keys, *guess.keys()], float(self._steps))] if self.lag else []
         count = self._graph().size() if self.lag else self._slots  # of iSAM2 alone a copy of all factors
         try:
-            result = self.isam.update(graph, guess, *used, *([spent] if spent else []))
+            self.isam.update(graph, guess, *used)
         except RuntimeError as error:
             self._restore(count, range(first, first + len(x)))
             said = shown(" ".join(str(error).split()), 200)
             raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
-        result = self.isam.getISAM2Result() if self.lag else result
-        slots = dict(zip(late, [*result.getNewFactorsIndices()][-len(late) :], strict=True)) if late else {}
-        for k, information in told.items():
-            slot = self._steadied.pop(k, (slots.get(k), None))[0]
-            if slot is not None and slot not in spent:
-                self._steadied[k] = slot, information
         self._steps, self._slots = self._steps + 1, count + graph.size()
-
-    def _told(
-        self, part: Problem, keys: Sequence[int], first: int, x: Floats, new: Collection[int]
-    ) -> dict[int, Floats]:
-        """(d, d) information about new points and those that are still steadied, given all other nodes."""
-        d = part.dimension
-        told: dict[int, Floats] = {k: np.zeros((d, d)) for k in new}
-        told |= {k: self._steadied[k][1].copy() for k in keys if k in self._steadied}
-        if told and part.factors:
-            linear = linearise(part.space, part.factors, None, self._at(part, keys, first, x))
-            for factor, jacobians in zip(part.factors, linear.jacobian, strict=True):
-                for nodes, J in zip(factor.nodes.T.tolist(), jacobians, strict=True):
-                    for k, own in zip(nodes, J[:, :, :d], strict=True):
-                        if keys[k] in told:
-                            told[keys[k]] += own.T @ own
-        return told
 
     def _at(self, part: Problem, keys: Sequence[int], first: int, x: Floats) -> Floats:
         """(n, ambient) the nodes of a step, new ones where they are guessed."""
@@ -190,7 +152,6 @@ class Incremental:
         self._slots = len(kept)
         for k in kept:
             graph.add(old.at(k))
-        self._steadied = {key: (kept.index(k), told) for key, (k, told) in self._steadied.items() if k in kept}
         for key in filter(guess.exists, new):
             guess.erase(key)
         params, used = self.isam.params(), list[Any]()
