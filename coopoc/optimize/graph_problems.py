@@ -25,10 +25,10 @@ from .starts.graph_starts import (
     parts,
     position_variance,
     rotation_variance,
-    separated,
     unwound,
 )
-from .starts.pose_starts import facing, graph_of, placed
+from .starts.initial import directed
+from .starts.pose_starts import graph_of
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
@@ -87,6 +87,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     first = "odometry" if start in ("auto", "incremental") else start
     start_x = _x0(graph, poses, first)
     problem = Problem(graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
+    problem = problem.replace_unchecked(x0=frozen(directed(problem, start_x)))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
         notes.append(
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
@@ -137,13 +138,10 @@ def started(problem: Problem) -> Problem:
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
-        x0 = {name: _x0(graph, problem.poses, name) for name in contenders(graph)}
-        starts: dict[str, Callable[[], Floats]] = {name: partial(placed, problem, x) for name, x in x0.items()}
-        first = starts["odometry"]()
-        at = problem.replace_unchecked(x0=frozen(first))
-        starts["odometry"] = lambda: first
-        if any(f.kind == "body_spherical" for f in problem.factors):
-            starts["facing"] = lambda: facing(at)
+        starts: dict[str, Callable[[], Floats]] = {
+            name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
+        }
+        at = problem.replace_unchecked(x0=frozen(directed(problem, starts["odometry"]())))
         at, won = _raced(graph, at, starts, lambda x: False, True)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
@@ -169,7 +167,6 @@ def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
 
         factors = _factors(graph, "chordal")
         x0 = chordal_start(Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses))
-    x0 = separated(graph, x0)
     return x0 if poses else x0[:, : graph.dimension]
 
 

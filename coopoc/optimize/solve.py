@@ -1,6 +1,5 @@
 """solve: a Problem and the name of a backend give a Solution, verified independently of the solver."""
 
-from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, instance
-from ..errors import InputError, MissingLibraryError
+from ..errors import InputError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES
 from .assess.active import constraint_rows
@@ -22,7 +21,7 @@ from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import directed, guessed, somewhere, undirected
 from .starts.mirrors import scaled
-from .starts.race import ELSEWHERE, QUIET_DRAWS, RIVAL_COST, higher, race, rival, scattered
+from .starts.race import ELSEWHERE, QUIET_DRAWS, doubts, drawn, race, scattered
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -152,36 +151,33 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
 
 def _searched(problem: Problem, start: Floats) -> Problem:
     """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or
-    random starts lead lowest, or, where noise does not explain the cost, a small convex relaxation."""
-
-    def relaxed(at: Problem) -> tuple[Floats, int]:
-        with suppress(InputError, MissingLibraryError):  # too large, or no such relaxation
-            return require_backend("cvxpy").solver(at, start, refine=False).x, 0
-        return start, 0
-
+    random starts lead lowest."""
     starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
     began = clock()
-    problem, won = race(problem, starts, {"relaxed": relaxed}, lambda x: False, draws=True)
+    problem, won = race(problem, starts, {}, lambda x: False, draws=True)
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
 def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverResult) -> tuple[Problem, SolverResult]:
     """The lowest feasible result of a problem with constraints, of the first and those from random places around it;
     the problem's notes are of the minima that were found."""
-    starts = islice(scattered(problem, first.x), QUIET_DRAWS)
-    few = {**options, "max_iterations": DRAWN_STEPS}
-    results = [first, *(backend.run(problem, y, few) for y in starts)]
-    scores = [
-        (max(float(constraint_rows(problem, each.x).outside.max()), FEASIBLE), problem.cost(each.x)) for each in results
-    ]
-    best = min(range(len(results)), key=scores.__getitem__)
-    least, search = scores[best][1], problem.search
-    near = [cost - least for beyond, cost in scores if beyond == FEASIBLE and higher(cost, least)]
-    notes = (rival(min(near)),) if min(near, default=np.inf) < RIVAL_COST else ()
-    steps = sum(each.iterations for each in results) - (not best) * first.iterations
-    search = search._replace(start="drawn" if best else search.start, iterations=search.iterations + steps, notes=notes)
-    result = backend.run(problem, results[best].x, options) if best else first
-    return problem.replace_unchecked(search=search), result
+    few, steps, search = {**options, "max_iterations": DRAWN_STEPS}, 0, problem.search
+
+    def descend(x: Floats) -> Floats:
+        nonlocal steps
+        end = backend.run(problem, x, few)
+        steps += end.iterations
+        return end.x
+
+    def cost(x: Floats) -> float:
+        return problem.cost(x) if constraint_rows(problem, x).outside.max() <= FEASIBLE else np.inf
+
+    x, ends = drawn(islice(scattered(problem, first.x), QUIET_DRAWS), first.x, descend, cost, QUIET_DRAWS)
+    notes, start = doubts(x, ends, cost), search.start
+    if x is not first.x:
+        steps, start, first = steps + first.iterations, "drawn", backend.run(problem, x, options)
+    search = search._replace(start=start, iterations=search.iterations + steps, notes=notes)
+    return problem.replace_unchecked(search=search), first
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:

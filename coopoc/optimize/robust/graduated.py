@@ -1,20 +1,21 @@
 """The graduated loop: weighted least squares and weights alternate while a nearly convex surrogate becomes the loss."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, frozen, number, one_of
+from ...arrays import Floats, Ints, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, STEP_TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
-from ..starts.mirrors import Cost, Descend, across, movable
-from ..starts.race import drawn
+from ..starts.mirrors import Cost, Descend, across, movable, scaled
+from ..starts.race import QUIET_DRAWS, doubts, drawn, higher, scattered
 from .candidates import Inner, Marked, mark
 
 MAX_ROUNDS = 300
@@ -28,6 +29,9 @@ EASY = 1e-6
 REGRADUATE_RATIO2 = 17.0
 """Squared ratio of a residual to its threshold from which the end graduates once more: it may then give up other
 measurements, as good as those that it rejects."""
+AGREEING_DRAWS, RIVAL_DISTANCE, PATH_SHARE = 6, 0.05, 0.8
+"""Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
+elsewhere, and that of the ranges whose shortest paths make a start."""
 GAINED = 1e-3
 """Share of the cost that another round must save."""
 
@@ -155,7 +159,13 @@ def contest(
         best = min(ends, key=costs.__getitem__)
         loose = movable(cauchy)
         mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
-        best_x, notes = drawn(cauchy, mirrored_x, loose, lambda at: landed(soft(at)), cost)
+        places = islice(_places(cauchy, mirrored_x, loose), QUIET_DRAWS)
+        best_x, tried = drawn(places, mirrored_x, lambda at: landed(soft(at)), cost, QUIET_DRAWS, AGREEING_DRAWS)
+        d, (lowest, _) = cauchy.dimension, min(tried, key=lambda end: end[0])
+        size = RIVAL_DISTANCE * np.ptp(np.concatenate([y[:, :d] for _, y in tried]), axis=0).max()
+        notes = doubts(best_x, [end for end in tried if np.abs(end[1] - best_x)[:, :d].max() > size], cost)
+        if sum(not higher(each, lowest) for each, _ in tried) == 1 < len(tried):
+            notes = *notes, f"one of {len(tried)} starts leads to this minimum: a lower one may exist"
         name, least = best if best_x is mirrored_x else "drawn", np.inf
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)
@@ -167,6 +177,19 @@ def contest(
             )
             moved += moves
     return name + ", mirrored" * (moved > 0), best_x, graduation, notes
+
+
+def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
+    """Nodes x (n, ambient) with the `loose` points `scattered`, and every other time where shortest paths along a part
+    of the ranges put them."""
+    rng = np.random.default_rng(0)
+    for k, y in enumerate(scattered(problem, x, loose)):
+        part = (
+            taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PATH_SHARE)) if f.kind == "range" else f
+            for f in problem.factors
+        )
+        paths = x if k % 2 or problem.poses else scaled(problem.replace_unchecked(factors=tuple(part)), x)
+        yield y if paths is x else paths
 
 
 def softened(marked: Marked, loss: str) -> Problem:

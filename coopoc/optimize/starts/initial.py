@@ -1,7 +1,5 @@
 """Where to start: the linear least-squares solution of the converted measurements."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ...arrays import Floats, Ints
@@ -9,7 +7,7 @@ from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..model.derivatives import linearise
 from ..model.factor import Factor, as_factor, bounded, unchecked
-from ..model.measurements import CONVERTED, converted_rows
+from ..model.measurements import converted_rows
 from ..model.problem import Problem
 
 TRIES = 5
@@ -35,8 +33,7 @@ def guessed(problem: Problem) -> tuple[Floats, bool]:
         return problem.x0.copy(), True
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give coopoc.optimize.pose(position, angle).")
-    x, touched = _converted(problem, np.zeros((len(problem.names), problem.dimension)))
-    return (x if touched else _apart(problem, x)), touched
+    return _converted(problem, np.zeros((len(problem.names), problem.dimension)))
 
 
 def _converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
@@ -47,14 +44,6 @@ def _converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     values[system.entries.diagonal] = own + RIDGE
     system.cholesky.factor(values)
     return system.retract(x, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
-
-
-def by_vectors(problem: Problem, x: Floats, still: Ints, vectors: Sequence[Factor]) -> Floats:
-    """Nodes x (n, ambient), all but the `still` ones moved to where vectors between them put them."""
-    d, moved = problem.dimension, x.copy()
-    part = Problem(problem.names, vectors, x[:, :d], dimension=d, fixed=tuple(still.tolist()))
-    moved[:, :d] = _converted(part, x[:, :d])[0]
-    return moved
 
 
 def directed(problem: Problem, x: Floats) -> Floats:
@@ -100,21 +89,6 @@ def somewhere(problem: Problem) -> Floats:
     for f in fixes:
         x[f.nodes[:, 0]] = f.z
     return x
-
-
-def _apart(problem: Problem, x: Floats) -> Floats:
-    """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
-    touched = np.zeros(len(x), dtype=bool)
-    for f in problem.factors:
-        if f.measurement.linear or f.kind == CONVERTED:
-            touched[f.nodes[f.informative]] = True
-    ranges = [f.z[:, 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
-    index = np.cumsum(~touched) - 1
-    turn, radius = 2.4 * index, np.sqrt(1.0 + index) * (ranges[0] if ranges else 1.0)
-    spiral = np.zeros_like(x)
-    spiral[:, 0], spiral[:, 1] = radius * np.cos(turn), radius * np.sin(turn)
-    middle = x[touched].sum(axis=0) / max(touched.sum(), 1)
-    return np.where(touched[:, None], x, middle + spiral)
 
 
 def as_vectors(factor: Factor) -> Factor:

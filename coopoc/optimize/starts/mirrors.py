@@ -1,4 +1,4 @@
-"""What ranges alone place: multidimensional scaling, moves across planes to lower minima, and consensus of ranges."""
+"""What ranges alone place: multidimensional scaling, and moves across planes to lower minima."""
 
 from collections.abc import Callable, Iterator
 from itertools import combinations, islice
@@ -11,7 +11,7 @@ from ..assess.assess import squared
 from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
 from ..model.space import nearest_rotation
-from .graph_starts import parts
+from .graph_starts import crossings, parts
 
 RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
@@ -19,21 +19,17 @@ LEVEL = "bearing", "azimuth"
 """Kinds whose measurements of a node in space fit its mirror image at a level plane as well."""
 PATH_NODES = 2000
 """Nodes up to which all shortest paths are taken."""
-SUBSETS = 60
-"""Of the ranges of a point, whose spheres are cut."""
 MAX_DESCENTS = 32
 """Moves that are followed by descents, of few bodies and the most promising first."""
 DOUBTED_COST, TRIED_COST = 10.0, 100.0
 """Cost, and as many times the cost of its ranges, that a move may add before the others have given way, to be a doubt
 and to be tried."""
+ELSEWHERE_SHARE = 0.05
+"""Share of its mean range by which a body must move to be elsewhere."""
 MOVE_ROUNDS = 15
 """Of moves, of which three are usual."""
 MIN_SAVING = 1e-6
 """Share of the cost that a move must save."""
-BELIEVED_STDS, MAJORITY = 4.0, 0.55
-"""Standard deviations within which a range fits a place, and the share of them that must, so that a point stays."""
-MOST_RANGED = 6
-"""Points with most ranges to others that are tried for the next one that is placed."""
 
 
 Descend = Callable[[Floats], Floats]
@@ -139,42 +135,12 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     return found
 
 
-def crossings(places: Floats, ranges: Floats) -> Floats:
-    """(C, d) points where d of the spheres of `ranges` (K,) around `places` (K, d) meet, or come nearest to it.
-
-    >>> crossings(np.array([[0.0, 0], [8, 0]]), np.array([5.0, 5])).round(6)
-    array([[ 4., -3.],
-           [ 4.,  3.]])
-    """
-    d = places.shape[1]
-    chosen = np.array([*islice(combinations(range(len(places)), d), 10 * SUBSETS)])
-    chosen = chosen[:: -(-len(chosen) // SUBSETS)]
-    p, r = places[chosen], ranges[chosen]
-    gap = p[:, 1:] - p[:, :1]
-    right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
-    foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
-    height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
-    up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
-    return np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d)
-
-
-def _plane(places: Floats) -> tuple[Floats, Floats]:
-    """Middle and normal of the best-fit plane of points (K, d)."""
-    middle = places.mean(axis=0)
-    return middle, np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
-
-
-def _image(points: Floats, plane: tuple[Floats, Floats]) -> Floats:
-    """Points (K, d) reflected at a plane."""
-    middle, normal = plane
-    return points - 2.0 * np.outer((points - middle) @ normal, normal)
-
-
-def _mirrored(problem: Problem, nodes: Floats, plane: tuple[Floats, Floats]) -> Floats:
-    """Nodes (K, ambient) moved as a rigid body as near as possible to their image, keeping their handedness."""
-    space = problem.space
-    at = space.position(nodes)
-    image = _image(at, plane)
+def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
+    """Nodes (K, ambient) moved as a rigid body as near as possible to their image at the best-fit plane of places
+    (K, d), keeping their handedness."""
+    space, middle = problem.space, places.mean(axis=0)
+    at, normal = space.position(nodes), np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
+    image = at - 2.0 * np.outer((at - middle) @ normal, normal)
     turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
     moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
     return space.join(moved, turn @ space.rotation(nodes))
@@ -187,64 +153,33 @@ def _outward(ranges: Ranges, body: Ints) -> tuple[Ints, Ints, Ints]:
     return rows, ranges.nodes[rows][inside[rows]], ranges.nodes[rows][~inside[rows]]
 
 
-def _all_mirrored(ranges: Ranges, loose: list[Ints]) -> Iterator[Floats]:
-    """All bodies together, reflected at the plane of what ranges any of them: ranges among them hold them there."""
-    if len(loose) < 2:
-        return
-    problem, x, (rows, _, outside) = ranges.problem, ranges.x, _outward(ranges, np.concatenate(loose))
-    if len(rows) < 2:
-        return
-    plane, y = _plane(problem.space.position(x[outside])), x.copy()
-    for body in loose:
-        y[body] = _mirrored(problem, x[body], plane)
-    gap = problem.space.position(y)[ranges.nodes]
-    cost = ranges.cost(np.linalg.norm(gap[:, 0] - gap[:, 1], axis=1)[:, None], np.arange(len(gap)))
-    if float(cost[0]) <= TRIED_COST * (1.0 + len(gap) / len(x)) * len(loose):
-        yield y
-
-
 def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
-    """Other places of a body, the cheapest first.
-
-    It is reflected at the best-fit plane of what ranges it, keeping its handedness, and a point is also put where its
-    spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image.
-    """
-    problem, x, (rows, own, other) = ranges.problem, ranges.x, _outward(ranges, body)
-    space, d = problem.space, problem.dimension
+    """Other places of a body: it is reflected at the best-fit plane of what ranges it, and a point is put where its
+    spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image."""
+    space, x, (rows, own, other) = ranges.problem.space, ranges.x, _outward(ranges, body)
     if len(rows) < 2:
         return []
-    places, at = space.position(x[other]), space.position(x[body])
-    plane = _plane(places)
-    flipped = _image(at, plane)
-    there = x[body].copy()
-    if len(body) == 1:
-        options = np.concatenate([at, flipped, *([crossings(places, ranges.distance[rows])] if len(rows) >= d else [])])
-        costs = ranges.cost(np.linalg.norm(options - places[:, None], axis=2), rows)
-        least = 0.05 * ranges.distance[rows].mean()
-        moves, image = list[Move](), 1
-        for k in (int(np.where(np.linalg.norm(options - at, axis=1) > least, costs, np.inf).argmin()), image):
-            if all(np.linalg.norm(options[k] - other) > least for other in (at[0], *(m[1][0, :d] for m in moves))):
-                there[0, :d] = options[k]
-                moves.append((float(costs[k] - costs[0]), there.copy(), body))
-        return moves
-    there = _mirrored(problem, x[body], plane)
-    moved = space.position(there)
-    index = np.searchsorted(body, own)
-    before, after = (ranges.cost(np.linalg.norm(p[index] - places, axis=1)[:, None], rows)[0] for p in (at, moved))
-    return [(float(after - before), there, body)]
+    at, places, index = space.position(x[body]), space.position(x[other]), np.searchsorted(body, own)
+    least = ELSEWHERE_SHARE * ranges.distance[rows].mean()
+
+    def costs(at: Floats) -> Floats:
+        """(C,) of places (C, K, d) of the body."""
+        return ranges.cost(np.linalg.norm(at[:, index] - places, axis=2).T, rows)
+
+    ends = [_mirrored(ranges.problem, x[body], places)]
+    if len(body) == 1 and len(rows) >= space.dimension:
+        met = crossings(places, ranges.distance[rows])[:, None]
+        ends.append(
+            space.join(met[np.where(np.linalg.norm(met - at, axis=2)[:, 0] > least, costs(met), np.inf).argmin()])
+        )
+    moved = np.stack([space.position(end) for end in ends])
+    far, adds = np.linalg.norm(moved - at, axis=2).max(axis=1) > least, costs(moved) - costs(at[None])
+    return [(add, end, body) for add, end, there in zip(adds.tolist(), ends, far, strict=True) if there]
 
 
 def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
-    """Points (n, ambient) to descend from: all bodies where they cost less, one after the other, then one at a time,
-    and several together."""
+    """Points (n, ambient) to descend from: one body at a time moved, and several together."""
     x = ranges.x
-    if any(adds < 0 for adds, _, _ in single):
-        y = x.copy()
-        for *_, body in single:
-            if (moves := _elsewhere(ranges._replace(x=y), body)) and moves[0][0] < 0:
-                y[body] = moves[0][1]
-        yield y
-    yield from _all_mirrored(ranges, [*{int(body[0]): body for *_, body in single}.values()])
     near = [move for move in single if move[0] <= TRIED_COST * (1.0 + len(ranges.nodes) / len(x))][:MAX_DESCENTS]
     together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
     for chosen in islice(together, MAX_DESCENTS):
@@ -293,70 +228,3 @@ def movable(problem: Problem) -> Ints:
     """Points of which nothing but ranges and fixes is measured."""
     held = [f.nodes.ravel() for f in problem.factors if f.kind not in ("range", "position")]
     return np.setdiff1d(np.arange(len(problem.names)), np.concatenate([problem.fixed, problem.poses, *held]))
-
-
-def regrown(problem: Problem, x: Floats) -> Floats:
-    """Nodes x (n, ambient) with points that disagree with most of their ranges placed anew by those to the others.
-
-    What disagrees most is left out, one point after the other, until the others agree. Of the crossings of the spheres
-    of a point, and its fixes, that counts with which most measurements agree; the point with most comes first.
-
-    References:
-        Fischler, Bolles, Random Sample Consensus, 1981; Moore et al., Robust distributed network localization with
-        noisy range measurements, SenSys 2004.
-
-    >>> truth = np.array([[0.0, 0], [9, 0], [0, 9], [9, 9], [4, 5]])
-    >>> pairs = np.stack(np.triu_indices(5, 1), axis=1)
-    >>> problem = Problem(tuple("abcde"), dimension=2)
-    >>> problem = problem.add("range", pairs, np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)), std=0.1)
-    >>> regrown(problem, np.vstack([truth[:4], [[30.0, 30.0]]]))[4].round(6)
-    array([4., 5.])
-    """
-    d, n, x = problem.dimension, len(x), x.copy()
-    places, ranges = x[:, :d], ranges_of(problem, x)
-    fixes = [f for f in problem.factors if f.kind == "position"]
-    fixed, fix = stacked(f.nodes[:, 0] for f in fixes), stacked((f.z for f in fixes), d)
-    root, known = stacked((f.root for f in fixes), d, d), stacked(np.full(len(f.z), f.loss is None) for f in fixes)
-
-    def agree(at: Floats, rows: Ints, others: Ints, own: Ints) -> tuple[Bools, Bools]:
-        """Whether ranges (K,) to others and fixes (F,) fit places (C, d): (C, K), (C, F)."""
-        length = np.linalg.norm(at[:, None] - places[others], axis=2)
-        off = np.einsum("fab,cfb->cfa", root[own], at[:, None] - fix[own])
-        fits = np.abs(length - ranges.distance[rows]) * ranges.weight[rows] <= BELIEVED_STDS
-        return fits, np.linalg.norm(off, axis=2) <= BELIEVED_STDS
-
-    kept, loose = np.ones(n, dtype=bool), movable(problem)
-    length = np.linalg.norm(places[ranges.nodes[:, 0]] - places[ranges.nodes[:, 1]], axis=1)
-    fits = np.abs(length - ranges.distance) * ranges.weight <= BELIEVED_STDS
-    near = np.linalg.norm(np.einsum("fab,fb->fa", root, places[fixed] - fix), axis=1) <= BELIEVED_STDS
-    while True:
-        both = kept[ranges.nodes].all(axis=1)
-        of, good = (
-            np.bincount(ranges.nodes[rows].ravel(), minlength=n) + d * np.bincount(fixed[own], minlength=n)
-            for rows, own in ((both, np.ones(len(fixed), dtype=bool)), (both & fits, near))
-        )
-        share = good[loose] / np.maximum(of[loose], 1)
-        out = kept[loose] & ((good[loose] <= d) | (share < MAJORITY))
-        if not out.any():
-            break
-        kept[loose[np.argmin(np.where(out, share, np.inf))]] = False
-    while not kept.all():
-        rows = np.flatnonzero(kept[ranges.nodes].sum(axis=1) == 1)
-        own = np.where(kept[ranges.nodes[rows, 0]], *ranges.nodes[rows, ::-1].T)
-        count, best, at = np.bincount(own, minlength=n), 0.0, None
-        left = np.flatnonzero(~kept)
-        for point in left[np.argsort(-count[left], kind="stable")][:MOST_RANGED].tolist():
-            of_point, own_fixes = rows[own == point], np.flatnonzero(fixed == point)
-            others = ranges.nodes[of_point].sum(axis=1) - point
-            if len(others) >= d or len(own_fixes):
-                there = crossings(places[others], ranges.distance[of_point]) if len(others) >= d else fix[:0]
-                there = np.concatenate([there, fix[own_fixes]])
-                by_range, by_fix = agree(there, of_point, others, own_fixes)
-                votes = by_range.sum(axis=1) + d * by_fix.sum(axis=1)
-                votes *= (by_fix | ~known[own_fixes]).all(axis=1)
-                if votes.max() > best:
-                    best, at = votes.max(), (point, there[np.argmax(votes)])
-        if at is None:
-            break
-        places[at[0]], kept[at[0]] = at[1], True
-    return x

@@ -1,7 +1,6 @@
 """Multi-start: a few steps of Levenberg-Marquardt from each start, and the lowest goes on."""
 
-from collections.abc import Callable, Iterator, Mapping
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -9,11 +8,12 @@ from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
-from ..model.factor import reweighed, taken
+from ..model.factor import reweighed
 from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
-from .mirrors import RANGES, Cost, Descend, across, regrown, scaled
+from .initial import directed
+from .mirrors import RANGES, Cost, Descend, across
 from .pose_starts import joining
 
 FIRST_STEPS = 12
@@ -36,9 +36,6 @@ DRAWS, QUIET_DRAWS, DRAWN_POINTS, HIGH_STDS = 90, 30, 1800, 2.0
 standard deviations above its mean, and as many points together."""
 SAME_MINIMUM, ROUNDED_COST = 1e-5, 1e-9
 """Share by which the costs of two random starts that led to the same minimum differ, and cost that is rounding."""
-AGREEING_DRAWS, RIVAL_DISTANCE, PATH_SHARE = 6, 0.05, 0.8
-"""Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
-elsewhere, and that of the ranges whose shortest paths make a start."""
 BARRIER = 0.1
 """Cost by which the way between two ends must be higher, so that they are not one flat minimum."""
 ELSEWHERE = "another minimum, elsewhere, costs as much"
@@ -92,36 +89,29 @@ def race(
     def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
+    def landed(x: Floats) -> Floats:
+        end = descend(x, LATER_STEPS[-1][1])
+        return end if arrived else np.full_like(end, np.nan)  # which is no minimum
+
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        x = descend(x, LATER_STEPS[-1][1]) if draws else x
-        ends, least = list[tuple[float, Floats]](), system.cost(x)
-        most = QUIET_DRAWS if least <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
-        for k, away in enumerate(scattered(problem, x) if draws else ()):
-            if k >= most:
-                break
-            y = descend(away, LATER_STEPS[-1][1])
-            cost = system.cost(y)
-            if arrived and cost < least + RIVAL_COST:
-                ends.append((cost, y))
-                most = DRAWS if higher(cost, least) or higher(least, cost) else most
-                if higher(least, cost):
-                    name, x, least = "drawn", y, cost
+        ends = list[tuple[float, Floats]]()
+        if draws:
+            x = descend(x, LATER_STEPS[-1][1])
+            quiet = QUIET_DRAWS if system.cost(x) <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
+            y, ends = drawn(scattered(problem, x), x, landed, system.cost, quiet)
+            name, x = (name if y is x else "drawn"), y
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
-        near = [each for each in (*rivals, *minima) if higher(each, cost, SAME_COST) and each < cost + RIVAL_COST]
-        near += [each for each, _ in ends if higher(each, cost) and each < cost + RIVAL_COST]
-        notes = (rival(min(near) - cost),) if near else ()
-        alike = [y for c, y in ends if not higher(c, cost) and np.abs(y - x).max() > SAME_COST * np.abs(x).max()]
-        if any(system.cost(0.5 * (x + y)) > cost + BARRIER for y in alike):
-            notes = *notes, ELSEWHERE
-        elif doubtful and not near:
+        ends += [(each, x) for each in (*rivals, *minima) if higher(each, cost, SAME_COST)]
+        notes = doubts(x, ends, system.cost)
+        if doubtful and not notes:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
             notes = (f"the measurements fit other places of {names} nearly as well: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     late, rough = dict(late), list[str]()
     for name, start in starts.items():
-        end, cost = attempt(name, start(), FIRST_STEPS, True), tried[name][0]
+        end, cost = attempt(name, directed(problem, start()), FIRST_STEPS, True), tried[name][0]
         if not smooth(end):
             rough.append(name)
         else:
@@ -229,49 +219,38 @@ def smooth(end: Arrival) -> bool:
     return bool(not damping.any() and (np.abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
 
 
-def drawn(problem: Problem, x: Floats, loose: Ints, descend: Descend, cost: Cost) -> tuple[Floats, tuple[str, ...]]:
-    """The lowest end (n, ambient) of descents from x and from random places of the `loose` points, each `regrown` while
-    that leads lower; and what makes it doubtful: no other start leads there, or some lead elsewhere for about the same
-    cost.
+def drawn(
+    places: Iterable[Floats], x: Floats, descend: Descend, cost: Cost, quiet: int, agreeing: int = DRAWS
+) -> tuple[Floats, list[tuple[float, Floats]]]:
+    """The lowest end (n, ambient) of x and of descents from other places, and all ends with their costs, x first.
+
+    So many places are tried as are `quiet`, or all where one leads to another minimum of about the cost; fewer where
+    `agreeing` lead to the lowest.
     """
-    ends, most, d = list[tuple[float, Floats]](), min(DRAWN_POINTS // len(x), QUIET_DRAWS), problem.dimension
-    best, least, agree = x, np.nan_to_num(cost(x), nan=np.inf), 0
-    for y in chain([x], _places(problem, x, loose)) if len(loose) else ():
-        y = descend(y) if ends else x
-        now = np.nan_to_num(cost(y), nan=np.inf)
-        while higher(now, after := cost(z := descend(regrown(problem, y)))):
-            y, now = z, after
-        ends.append((now, y))
-        best, least = (y, now) if higher(least, now) else (best, least)
-        agree = sum(not higher(each, least) for each, _ in ends)
-        if agree == AGREEING_DRAWS or len(ends) > most:
+    best, least, most = x, float(np.nan_to_num(cost(x), nan=np.inf)), quiet
+    ends = [(least, x)]
+    for y in places:
+        if len(ends) > most or sum(not higher(each, least) for each, _ in ends) >= agreeing:
             break
-    size = RIVAL_DISTANCE * np.ptp(np.concatenate([y[:, :d] for _, y in ends] or [x]), axis=0).max()
-    near = [each - least for each, y in ends if each < least + RIVAL_COST and np.abs(y - best)[:, :d].max() > size]
-    notes = (rival(min(near)) if higher(least + min(near), least) else ELSEWHERE,) if near else ()
-    if agree == 1 < len(ends):
-        notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
-    return best, notes
+        y = descend(y)
+        now = float(np.nan_to_num(cost(y), nan=np.inf))
+        ends.append((now, y))
+        if now < least + RIVAL_COST and (higher(now, least) or higher(least, now)):
+            most = DRAWS
+        best, least = (y, now) if higher(least, now) else (best, least)
+    return best, ends
+
+
+def doubts(x: Floats, ends: Iterable[tuple[float, Floats]], cost: Cost) -> tuple[str, ...]:
+    """Notes on other ends, with their costs, than the minimum x: one elsewhere costs as much, or one little more."""
+    least, ends = cost(x), [*ends]
+    near = [each - least for each, _ in ends if higher(each, least) and each < least + RIVAL_COST]
+    notes = (f"another minimum costs {min(near):.3g} more: noise may decide between them",) if near else ()
+    alike = [y for each, y in ends if not higher(each, least) and np.abs(y - x).max() > SAME_COST * np.abs(x).max()]
+    elsewhere = any(cost(0.5 * (x + y)) > least + BARRIER for y in alike)
+    return (ELSEWHERE, *notes) if elsewhere else notes
 
 
 def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
     """Whether a cost is above another by more than that share, and than rounding makes of exact data."""
     return cost > (1.0 + share) * least + ROUNDED_COST
-
-
-def rival(more: float) -> str:
-    """The note on a minimum that costs more."""
-    return f"another minimum costs {more:.3g} more: noise may decide between them"
-
-
-def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
-    """Nodes x (n, ambient) with the `loose` points `scattered`, and every other time where shortest paths along a part
-    of the ranges put them."""
-    rng = np.random.default_rng(0)
-    for k, y in enumerate(scattered(problem, x, loose)):
-        part = (
-            taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PATH_SHARE)) if f.kind == "range" else f
-            for f in problem.factors
-        )
-        paths = x if k % 2 or problem.poses else scaled(problem.replace_unchecked(factors=tuple(part)), x)
-        yield y if paths is x else paths
