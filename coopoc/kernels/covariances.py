@@ -129,28 +129,30 @@ def mark_odometers(
         motion: variances of a velocity: relative, what of that lasts, and least (m/s)^2.
         dt: s.
     """
-    now, last = np.zeros((2, 3)), np.zeros((2, 3))  # means, and their variances
+    now, last, moved = np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(3)  # means, and their variances
     for run in range(len(gnss)):
         for k in range(len(columns)):
             count, first, begin, after, square, old = 0, 0, -1, 0, 0.0, 0.0
-            moved = np.zeros(3)
-            now[:] = 0.0
+            for c in range(3):
+                moved[c] = now[0, c] = now[1, c] = 0.0
             for t in range(gnss.shape[1] if doubtful[run, k] > DOUBT / 3.0 else 0):
-                z, u, slip = gnss[run, t, columns[k]], velocity[run, t, columns[k]], 0.0
+                slip = 0.0
                 for c in range(3 if t > 0 else 0):
-                    moved[c], square = moved[c] + dt * u[c], square + dt * dt * u[c] * u[c]
-                if t < after or math.isnan(z[0]):
+                    way = dt * velocity[run, t, columns[k], c]
+                    moved[c], square = moved[c] + way, square + way * way
+                if t < after or math.isnan(gnss[run, t, columns[k], 0]):
                     continue
                 first, count, after, steps = t if count == 0 else first, count + 1, t + every, t - begin
                 for c in range(3):
-                    now[0, c] += (z[c] - moved[c]) / TOGETHER
+                    now[0, c] += (gnss[run, t, columns[k], c] - moved[c]) / TOGETHER
                     now[1, c] += (fix[t, columns[k], 0, c] / TOGETHER + fix[t, columns[k], 1, c]) / TOGETHER
                 if count < TOGETHER:
                     continue
                 walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
                 for c in range(3):
                     slip += (now[0, c] - last[0, c]) ** 2 / (now[1, c] + last[1, c] + walk)
-                last[:], now[:] = now, 0.0
+                    for i in range(2):
+                        last[i, c], now[i, c] = now[i, c], 0.0
                 for i in range(max(begin, 0), t + 1 if begin >= 0 and slip > DOUBT else 0):
                     marks[2, k, i] = 1
                 begin, count, square, old = first, 0, 0.0, square
