@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, number, plain
-from ..errors import InputError
+from ..errors import InputError, shown
 from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
-from ..world.plausible import MAX_POSITION, MAX_SPEED
+from ..world.plausible import MAX_POSITION, MAX_SPEED, radians
 
 
 class MotionHistory:
@@ -104,6 +104,16 @@ def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
     """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
     fix = np.full(3, np.nan) if gnss is None else numbers(gnss)
     return fix if fix.shape == (3,) and np.isnan(fix).all() else three(field, "none" if gnss is None else gnss)
+
+
+def relative_vector(value: npt.ArrayLike) -> Floats:
+    """(3,) range m and two angles rad, NaN where not measured; InputError for a range <= 0 and angles in degrees."""
+    relative = numbers(value)
+    if relative.shape != (3,) or not (0.0 < relative[0] < MAX_POSITION or np.isnan(relative[0])):
+        text = "must be three numbers, the range first and > 0"
+        raise InputError("relative", shown(value), text, "Give NaN for what was not measured.")
+    radians("relative angles", relative[1:])
+    return relative
 
 
 def seconds(field: str, value: float) -> float:

@@ -32,9 +32,9 @@ from ..kernels.stars.cooperative_state import (
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_step
 from ..world.links import drop_steep_azimuths
-from ..world.plausible import MAX_POSITION, MAX_SPEED, radians
+from ..world.plausible import MAX_POSITION, MAX_SPEED
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
-from .motion_history import MotionHistory, fix_or_none, numbers, seconds, three
+from .motion_history import MotionHistory, fix_or_none, relative_vector, seconds, three
 from .noise_model import constant_noise, motion_noise
 
 FIRST = np.zeros(1, np.int64)
@@ -70,11 +70,9 @@ class RelativeMeasurement:
 
     def __post_init__(self) -> None:
         row = np.full(WIDTH, np.nan)
-        relative, named = numbers(self.relative), isinstance(self.id, str) and self.id
-        if relative.shape != (3,) or not named or not (0.0 < relative[0] < MAX_POSITION or math.isnan(relative[0])):
-            text = "must have a name and three numbers, the range first and > 0"
-            raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
-        radians("relative angles", relative[1:])
+        if not (isinstance(self.id, str) and self.id):
+            raise InputError("id", shown(self.id), "must be a name", 'Give for example "b".')
+        relative = relative_vector(self.relative)
         row[:AGE], row[AGE] = (
             components(drop_steep_azimuths(relative)[None, None], FIRST)[0, 0],
             seconds("age", self.age),

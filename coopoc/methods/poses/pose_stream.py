@@ -10,8 +10,8 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...world.links import wrap
-from ...world.plausible import MAX_POSITION, MAX_SPEED, MAX_YAW_RATE, UNWRAPPED, radians
-from ..motion_history import fix_or_none, numbers, three
+from ...world.plausible import MAX_SPEED, MAX_YAW_RATE, UNWRAPPED, radians
+from ..motion_history import fix_or_none, relative_vector, three
 
 if TYPE_CHECKING:
     from ...kernels.poses.ekf import PoseOptions
@@ -65,17 +65,8 @@ class LandmarkMeasurement:
     position: npt.ArrayLike
 
     def __post_init__(self) -> None:
-        for name in ("relative", "position"):
-            values = numbers(getattr(self, name))
-            if (
-                values.shape != (3,)
-                or (np.abs(values) > MAX_POSITION).any()
-                or (name == "position" and np.isnan(values).any())
-            ):
-                component, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
-                raise InputError(name, component, "must be three numbers", hint)
-            self.__dict__[name] = values
-        radians("relative angles", self.relative[1:])  # type: ignore[index, arg-type]
+        self.__dict__["relative"] = relative_vector(self.relative)
+        self.__dict__["position"] = three("position", self.position)
 
 
 class PoseEstimate(NamedTuple):
