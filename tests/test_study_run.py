@@ -162,6 +162,11 @@ def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path):
     assert "must not repeat a parameter" in reasons[1]
     assert reasons[2].startswith("Arrow")
 
+    def half(params):
+        raise ValueError("\ud800, half a pair")
+
+    assert "half a pair" in run_study(Study("half", "?", half, {"x": (1,)}), tmp_path).failures["reason"][0]
+
 
 def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first():
     cells = [Cell({}, {"k": k, "m": m}, f"{k}{m}") for m in "ab" for k in range(4)]

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from ..arrays import listed, named
 from ..errors import InputError
+from ..text import uncontrolled
 from ..workers import leave_with
 from . import store
 from .cell import Cell, Params, Row
@@ -57,7 +58,7 @@ def attempt(function: Function, cell: Cell) -> Outcome:
         with threadpool_limits(limits=1):
             rows = _checked(function(cell.settings), cell)
     except (Exception, SystemExit) as error:
-        reason, trace = f"{type(error).__name__}: {error}", traceback.format_exc()
+        reason, trace = map(uncontrolled, (f"{type(error).__name__}: {error}", traceback.format_exc()))
     return Outcome(cell, rows, reason, trace, time.perf_counter() - start)
 
 
