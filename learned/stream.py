@@ -42,11 +42,11 @@ class GainStream:
         fix, _ = self.history.forward(gnss, fix_age)
         if np.isnan(self._x).all():
             self._x = fix
-            return fix, None
+            return fix.copy(), None
         near, motion = (torch.as_tensor(a[None], dtype=self._memory.x.dtype) for a in (fix - self._x, moved))
         with torch.inference_mode():
             memory, _ = self._model.step(self._memory, near, motion, 1.0)
             positions = [name for name in self._model.positions if name in memory._fields]
             self._memory = memory._replace(**{name: getattr(memory, name) - memory.x for name in positions})
         self._x = self._x + memory.x[0].numpy()
-        return self._x, None
+        return self._x.copy(), None

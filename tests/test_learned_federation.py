@@ -154,6 +154,7 @@ def test_too_few_answers_for_the_rule_are_said(four):
         ({"aggregate": "krum"}, r"Krum\(byzantine=1, keep=1\) with 4 clients a round: takes at least 5"),
         ({"aggregate": Krum(0, keep=3), "participation": Participation(0.5)}, "with 2 clients a round"),
         ({"rounds": 0}, "rounds = 0"),
+        ({"aggregate": lambda weights, sizes: weights.mean(0).numpy()}, "must be a Tensor"),
     ],
 )
 def test_what_cannot_be_federated_is_said_at_once(four, options, words):

@@ -110,7 +110,7 @@ def test_a_long_step_is_two_short_ones(name):
     for stream in (once, twice):
         stream.step(Z, U, 0.1)
         stream.step(Z + 1.0, U, 0.1)
-    twice.step(None, U, 0.1)
+    twice.step(None, U, 0.1)[0][:] = 0.0  # an estimate is the caller's
     (x, cov), (same_x, same_cov) = once.step(None, U, 0.2), twice.step(None, U, 0.1)
     near = 1e-6 if name == "net" else 1e-12
     assert_allclose(x, same_x, atol=near)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from coopoc import InputError
+from coopoc.arrays import instance
 
 from .rules import Rule
 
@@ -114,7 +115,7 @@ def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tu
     if note := too_few(rule, len(accepted)):
         return unchanged, rejected, note
     weights, sizes = torch.stack([a.weights for a in accepted]), torch.tensor([a.size for a in accepted])
-    combined = rule(theta, weights, sizes)
+    combined = instance("aggregate", rule(theta, weights, sizes), Tensor, "Return the new weights (P,).")
     if combined.shape != theta.shape:
         allowed = f"must have the shape {tuple(theta.shape)} of the net's weights"
         shape = f"{rule.name} -> {tuple(combined.shape)}"
