@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Floats, Ints, check_fields, checked, instance, number, refuse, remade, texts
 from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
+from ..plugins import find
 from ..text import short_repr
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
@@ -210,13 +211,16 @@ def _held_out(make: type[NoiseModel], recording: Recording, fleet: Fleet) -> tup
     stated, in the mean over blocks of time, and half its 95 % interval; infinite where nothing shows it."""
     from scipy.stats import t
 
-    from .kalman import Kalman
+    split, kalman = 2 * len(recording.t) // 3, find("coopoc.methods", "kalman")
+    egos = [column for column in recording.observers if recording.stretches(column)]
 
-    split = 2 * len(recording.t) // 3
-    models = make._constant(recording.between(0, split), fleet.between(0, split)), make.nominal(recording.sensors)
-    gaps = [(Kalman(model)(recording).x - fleet.position)[:, split:, :, :2] for model in models]
-    parts = [[part for part in np.array_split(gap, HELD_OUT, axis=1) if np.isfinite(part).any()] for gap in gaps]
-    change = np.subtract(*([np.sqrt(np.nanmean(part**2)) for part in of_one] for of_one in parts))
+    def errors(model: NoiseModel) -> Floats:
+        gap = (kalman(model)(recording, egos).x - fleet.position[:, egos])[:, split:, :, :2]
+        parts = [part for part in np.array_split(gap, HELD_OUT, axis=1) if np.isfinite(part).any()]
+        return np.array([np.sqrt(np.nanmean(part**2)) for part in parts])
+
+    fitted = make._constant(recording.between(0, split), fleet.between(0, split))
+    change = errors(fitted) - errors(make.nominal(recording.sensors))
     if len(change) < 2:
         return 0.0, np.inf
     return float(change.mean()), float(t.ppf(0.975, len(change) - 1) * change.std(ddof=1) / np.sqrt(len(change)))
