@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +14,6 @@ from tyro.conf import Positional, arg
 
 from ..errors import InputError, dependencies
 from ..formats import load_graph
-from ..formats.graph import Graph
 from .backend import backends
 from .graph_problems import Objective, Start, from_graph, loop_closures
 from .model.problem import Problem
@@ -49,14 +48,15 @@ def solve_file(
         file: graph in .pyfg or .g2o.
         backend: solver (see coopoc check).
         objective: chordal (quadratic, can be certified), or geodesic with the full covariances.
-        start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of all.
+        start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of all. Where outliers
+            are looked for it is odometry.
         output: file for the solution with all nodes, as JSON; a summary goes to stdout.
         outliers: find wrong loop closures and relative poses between robots, and leave them out (solve_gnc).
         repair: take the nearest positive definite matrix where a g2o file's information is none.
         covariance: compute marginals of graphs of more than 1,000 nodes, too.
     """
     graph = load_graph(file, repair)
-    problem = (known_inliers_first if outliers else from_graph)(graph, objective, start)
+    problem = from_graph(graph, objective, "odometry" if outliers else start)
     say(str(problem))
     solve_one = partial(solve, throw=False, covariance=covariance or None)
     solution = (without_outliers if outliers else solve_one)(problem, backend)
@@ -81,17 +81,6 @@ def solve_file(
 def say(message: str) -> None:
     """Print a message to stderr, beside the result on stdout."""
     print(f"coopoc: {message}", file=sys.stderr)
-
-
-def known_inliers_first(graph: Graph, objective: Objective, start: Start) -> Problem:
-    """The problem of a graph from where its known inliers lead, all but relative poses beside each robot's odometry."""
-    problem = from_graph(graph, objective, "odometry")
-    doubtful = [row for _, rows in loop_closures(problem) for row in rows]
-    every = graph.relative_pose
-    kept = np.setdiff1d(np.arange(len(every)), doubtful)
-    kept_edges = {field.name: getattr(every, field.name)[kept] for field in fields(every)}
-    began = from_graph(replace(graph, relative_pose=replace(every, **kept_edges)), objective, start)
-    return problem.replace_unchecked(x0=began.x0, search=began.search)
 
 
 def without_outliers(problem: Problem, backend: str) -> Solution:

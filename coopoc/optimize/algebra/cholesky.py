@@ -139,7 +139,7 @@ def cholesky_of(matrix: Any) -> Cholesky | None:
     return cholesky if cholesky.factor(upper.data) else None
 
 
-def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
+def columns_solved(cholesky: Cholesky | DenseCholesky, right: Floats) -> Floats:
     """(u, K) A^-1 right, column by column."""
     return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 

@@ -491,8 +491,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     wanted = system.entries.number[places].ravel()
     moving = np.flatnonzero(wanted >= 0)
     whole = np.zeros((len(wanted), len(wanted)))
-    for column in moving.tolist():
-        unit = np.zeros(system.size)
-        unit[wanted[column]] = 1.0
-        whole[moving, column] = system.cholesky.solve(unit)[wanted[moving]]
+    unit = np.zeros((system.size, len(moving)))
+    unit[wanted[moving], np.arange(len(moving))] = 1.0
+    whole[np.ix_(moving, moving)] = columns_solved(system.cholesky, unit)[wanted[moving]]
     return whole.reshape(len(places), dof, len(places), dof).swapaxes(1, 2)

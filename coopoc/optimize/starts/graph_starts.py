@@ -149,8 +149,7 @@ def chained(graph: Graph) -> Floats:
 
 def tree(graph: Graph) -> Floats:
     """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
-    between robots too, then averaged: first rotations, then positions with these; what it does not join hangs on as in
-    `chained`.
+    between robots too, their rotations then averaged; what it does not join hangs on as in `chained`.
 
     With turns w_k of R_k in the world and e = log(R_j R_ij^T R_i^T) sum |e + w_j - w_i|^2 / var is least where a
     Laplacian of the graph, which is factored once, times w is the divergence of e.
@@ -159,21 +158,20 @@ def tree(graph: Graph) -> Floats:
         Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
         and accurate approximation for planar pose graph optimization, IJRR 2014.
     """
-    edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph)
+    edges, roots = graph.relative_pose, _roots(graph)
     position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
     (i, j), part = edges.nodes.T, parts(len(rotation), edges.nodes)
     if len(edges) >= reached.sum() - part.max():
         still = np.unique(part, return_index=True)[1]
         for root, _, _ in reversed(roots):
             still[part[root]] = root
-        turns = _averaging(edges.nodes, rotation_variance(edges.covariance, d), still, len(rotation))
+        variance = rotation_variance(edges.covariance, graph.dimension)
+        turns = _averaging(edges.nodes, variance, still, len(rotation))
         for _ in range(SWEEPS):
             step = turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))
             rotation = exp(step) @ rotation
             if np.abs(step).max(initial=0.0) <= STAGE_TOLERANCE:
                 break
-        moved = _averaging(edges.nodes, position_variance(edges.covariance, d), still, len(rotation))
-        position += moved(position[j] - position[i] - np.einsum("mab,mb->ma", rotation[i], edges.position))
     return with_points(graph, position, rotation, reached)
 
 
