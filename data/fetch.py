@@ -71,9 +71,8 @@ class Entry:
 
     @property
     def fetched(self) -> bool:
-        """Whether every file is there with its size; `fetch` compares the hashes, too."""
-        files = {self.folder / file: size for file, (_, size, _) in self.files.items()}
-        return not self.by_hand and all(path.is_file() and path.stat().st_size == files[path] for path in files)
+        """Whether every file is there with its bytes."""
+        return not self.by_hand and not self.absent()
 
     def absent(self) -> list[str]:
         """Files that are not there, or with other bytes."""
@@ -177,7 +176,10 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
 
     absent = entry.absent()
     if absent and offline:
-        raise _offline(entry, absent)
+        file = entry.folder / absent[0]
+        state = f"SHA-256 {_digest(file)} must have SHA-256 {entry.files[absent[0]][2]}" if file.exists() else "missing"
+        reason = f"offline, and {len(absent)} of {len(entry.files)} files are not there, first {file.name}: {state}"
+        raise _by_hand(entry, entry.address(absent[0]), file, reason)
     if absent:
         try:
             entry.folder.mkdir(parents=True, exist_ok=True)
@@ -204,9 +206,7 @@ def _bring(entry: Entry, timeout: float) -> None:
         address, (_, size, digest), path = entry.address(file), entry.files[file], entry.folder / file
         data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
         if (actual := hashlib.sha256(data).hexdigest()) != digest:
-            raise _other_bytes(
-                f"{entry.name}: {path.name}", actual, digest, f"It was removed: {address} serves another file."
-            )
+            raise _by_hand(entry, address, path, f"SHA-256 {actual} must have SHA-256 {digest}; it was removed")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
 
@@ -267,28 +267,6 @@ def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
         f"was not fetched: {reason}",
         f"Fetch it by hand (the project: {entry.page}), {advice}, and run coopoc data get {entry.name} again.",
     )
-
-
-def _offline(entry: Entry, absent: list[str]) -> InputError:
-    """The error of what is absent and may not be downloaded."""
-    file = entry.folder / absent[0]
-    if file.exists():
-        return _other_bytes(
-            f"{entry.name}: {file.name}",
-            _digest(file),
-            entry.files[absent[0]][2],
-            f"Remove {file}; then run coopoc data get {entry.name} with a network.",
-        )
-    return _by_hand(
-        entry,
-        entry.address(absent[0]),
-        file,
-        f"offline, and {len(absent)} of {len(entry.files)} files are missing (coopoc data show {entry.name})",
-    )
-
-
-def _other_bytes(field: str, actual: str, digest: str, hint: str) -> InputError:
-    return InputError(field, f"SHA-256 {actual}", f"must have SHA-256 {digest}", hint)
 
 
 def _digest(path: Path) -> str:

@@ -10,7 +10,6 @@ import scipy  # its statistics take half a second, and are imported where they a
 
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import dimensions
-from coopoc.workers import progress_bar
 
 from .estimates import (
     BEHIND,
@@ -88,25 +87,18 @@ def check(log: Log) -> Check:
         InputError: no vehicle that a filter follows; in body frames, vehicles that share no two steps, or first poses
             that are not known.
     """
-    bar = progress_bar(desc=f"check of {log.summary.name}", total=len(CHECKS) + 2, delay=2.0)
     first = filtered(log)
-    bar.update()
     rows = _vehicles(first)
     errs, drifts = ([first.world.ids.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
     result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
-    bar.update()
     result = replace(result, vehicles=_vehicles(result))
     if log.truth is not None and not any(_late(first, row) for row in result.vehicles) and not result.slack.any():
         result = against_truth(result)
     elif log.recording.body is None:  # what errs says nothing of others
         result = _without(result, errs)
     result = replace(result, measurements=measurements(result))
-    sentences = list[str]()
-    for rule in CHECKS:
-        sentences += rule(result)
-        bar.update()
-    bar.close()
-    return replace(result, warnings=tuple(sentences), unseen=tuple(_unseen(result)))
+    sentences = tuple(sentence for rule in CHECKS for sentence in rule(result))
+    return replace(result, warnings=sentences, unseen=tuple(_unseen(result)))
 
 
 def _without(c: Check, columns: Sequence[int]) -> Check:

@@ -23,8 +23,8 @@ UNSTATED = "standard deviations of {}: none was logged"
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
-PERIODS, HOUR = (86400.0, 604800.0), 3600.0
-"""s, of clocks: a day, a GPS week; and by which local time leaps."""
+PERIODS = 86400.0, 604800.0
+"""s, of clocks: a day, a GPS week."""
 SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
@@ -57,10 +57,6 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
         summary.assume(
             f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set; rows are in their order"
         )
-    times = np.unique(rows["t"].dropna())
-    leap = np.flatnonzero(np.abs(np.diff(times) - HOUR) < HOUR / 60)
-    if len(leap) == 1:
-        summary.assume(f"stamps of all leap by an hour from {times[leap[0]]:.10g} s on, as local time does: give UTC")
     return rows
 
 
