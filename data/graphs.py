@@ -135,17 +135,16 @@ def _relative(graph: Graph, column: Ints, robots: int, begin: float) -> Floats:
 
 
 def _sensors(graph: Graph, dt: float) -> Sensors:
-    """Noise that the file states; that of an odometry edge is white, so that its variance grows with its time."""
+    """Noise that the file states; that of an odometry edge is white, so that its variance grows with its time, that of
+    a point as wide along as across."""
     edges, stamps = graph.relative_pose, graph.stamps
     lasts = stamps[edges.nodes[:, 1]] - stamps[edges.nodes[:, 0]]
     own = (lasts > 0) & ~_others(graph)
     move, turn = (np.sqrt(np.mean(dt / lasts[own] * edges.covariance[own, k, k])) / dt for k in (0, 2))
     points = _vectors(graph)
     square = np.square(points.position).sum(axis=1)
-    ahead = points.position / np.sqrt(np.maximum(square, FLAT**2))[:, None]
-    along, whole = np.einsum("mi,mij,mj->m", ahead, points.covariance, ahead), np.trace(points.covariance.T)
-    bearing = (whole - along) / np.maximum(square, whole)
-    along = np.append(along, graph.ranges.variance)
+    half = np.trace(points.covariance.T) / 2.0
+    bearing, along = half / np.maximum(square, half), np.append(half, graph.ranges.variance)
     return Sensors(
         gnss_std=(1.0, 1.0, FLAT),
         velocity_std_ratio=0.0,

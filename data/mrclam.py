@@ -15,8 +15,8 @@ from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
 
 from .assemble import PLANE_STD, backward_difference, check_size, check_time, interpolate, planar_recording
-from .log.heading import Signal
-from .log.motion import step_means
+from .log.frames import RATE_BIAS_STD, SCALE_STD
+from .log.heading import Signal, step_means
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
@@ -209,7 +209,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     Source: the variance of batch means, Conway, Some tactical problems in digital simulation, Man. Sci. 10(1), 1963.
     """
     dt = log.fleet.dt
-    first, window, block = slice(1, int(until / dt)), int(WINDOW / dt), int(LASTING_SECONDS / dt)
+    first, window = slice(1, int(until / dt)), int(WINDOW / dt)
     if not 10 * WINDOW <= until < log.fleet.t[-1]:
         raise InputError(
             "calibrate_s",
@@ -225,7 +225,8 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     (turn,), slip = _factors(window, rate, turning), -lost / speed
     driven = _driven(speed, slip, wheel, turning)
     ahead, aside, off = velocity[..., 0] - driven, velocity[..., 1], rate - turn * turning
-    forward, side, yaw = (summed(error, window) for error in (ahead, aside, off))
+    t, robot = np.broadcast_arrays(log.fleet.t[first, None][: len(rate)], np.arange(len(log.fleet.ids)))
+    forward, side, yaw = (grouped(e[there := np.isfinite(e)], robot[there], t[there]) for e in (ahead, aside, off))
     ranges, bearings = _relative(log, until)
     sensors = Sensors(
         velocity_std_ratio=forward / np.sqrt(np.mean(driven**2)),
@@ -235,8 +236,8 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
         azimuth_std=bearings,
         inclination_std=PLANE_STD,
         compass=False,
-        speed_scale_std=_in_blocks(ahead, driven, block),
-        yaw_rate_bias_std=_in_blocks(off, np.ones(rate.shape), block),
+        speed_scale_std=SCALE_STD,
+        yaw_rate_bias_std=RATE_BIAS_STD,
         odometry_error_time=LASTING_SECONDS,
         min_range=0.0,
     )
@@ -263,23 +264,10 @@ def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
 
 
-def _in_blocks(error: Floats, regressor: Floats, steps: int) -> float:
-    """Rms over robots and blocks of steps of the factor of a regressor (T, N) that explains errors (T, N) best."""
-    starts = range(0, len(error) - steps + 1, steps)
-    factors = [_factors(1, error[first : first + steps], regressor[first : first + steps])[0] for first in starts]
-    return float(np.sqrt(np.nanmean(np.square(factors))))
-
-
-def summed(error: Floats, window: int) -> float:
-    """Standard deviation of white noise whose sums over a window are as large as those of the errors (T, N)."""
-    whole = error[: len(error) // window * window].reshape(-1, window, error.shape[1])
-    return float(np.sqrt(np.nanmean(whole.sum(axis=1) ** 2) / window))
-
-
-def grouped(error: Floats, observer: Floats | Ints, t: Floats) -> float:
+def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = np.inf) -> float:
     """Standard deviation of white noise whose sums over what a robot measures in a window are as large as those of the
-    errors (M,), outliers aside."""
-    inlier = np.abs(error - np.median(error)) <= ROBUST * robust_std(error)
+    errors (M,), those beyond a gate of robust standard deviations aside."""
+    inlier = np.abs(error - np.median(error)) <= gate * robust_std(error)
     group = np.unique(observer[inlier] * 10**6 + np.floor(t[inlier] / WINDOW), return_inverse=True)[1]
     sums = np.bincount(group, error[inlier])
     return float(np.sqrt((sums**2).sum() / inlier.sum()))
@@ -297,7 +285,7 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
             f"must be {CALIBRATING_COUNT} or more",
             "Take longer.",
         )
-    ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, wrap(angle)))
+    ranges, bearings = (grouped(error[used], observer[used], t[used], ROBUST) for error in (reach, wrap(angle)))
     return ranges, bearings
 
 

@@ -12,7 +12,7 @@ from scipy.linalg import lstsq
 
 import coopoc as co
 from coopoc.arrays import robust_std
-from coopoc.data.mrclam import calibrate, grouped, pose_recording, read_mrclam, summed
+from coopoc.data.mrclam import ROBUST, calibrate, grouped, pose_recording, read_mrclam
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_frames import gauss_markov, midway, turned
@@ -61,14 +61,11 @@ def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen):
 
 def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened():
     """Closed form: sums of n terms of an autoregression have variance n s^2 (1 + c) / (1 - c) (Bartlett 1946)."""
-    normals = np.random.default_rng(0).standard_normal((200_000, 1))
-    assert summed(normals, 200) == pytest.approx(1.0, rel=0.05)
-    c = np.exp(-0.2)
-    lasting = gauss_markov(normals, 0.2)
-    assert summed(lasting, 200) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
-    t = np.arange(200_000) * 0.1
-    robot = np.zeros(len(t), dtype=np.int64)
-    assert grouped(lasting[:, 0], robot, t) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
+    normals, t = np.random.default_rng(0).standard_normal((200_000, 1)), np.arange(200_000) * 0.1
+    c, lasting, robot = np.exp(-0.2), gauss_markov(normals, 0.2), np.zeros(len(t), dtype=np.int64)
+    for gate in (np.inf, ROBUST):
+        assert grouped(normals[:, 0], robot, t, gate) == pytest.approx(1.0, rel=0.05)
+        assert grouped(lasting[:, 0], robot, t, gate) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
 
 
 def test_odometry_follows_its_log_late_and_slower_in_turns(log, known):

@@ -140,7 +140,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         }
         if truth is not None:
             row["fix_error_m"] = _rms(rec.gnss[0, :, column] - truth.position[:, column])
-            row["error_m"] = _rms(c.scored[0][:, column] - truth.position[:, column])
+            row["error_m"] = _rms(c.x[:, column] - truth.position[:, column])
             row["error_per_std"], row["worst_at_s"] = worst(c, column)
         rows.append(row)
     return rows
@@ -442,10 +442,6 @@ def _unseen(c: Check) -> list[str]:
     fixes = np.isfinite(c.fix[..., 0]).sum(axis=0)
     if few := [who for who in every if fixes[c.world.ids.index(who)] < LEAST_COUNT]:
         sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
-    sensors = c.world.sensors
-    stated = {"fixes": sensors.gnss_std[0]} | {f"{row['measurement']}s": row["stated_std"] for row in c.measurements}
-    if near := [f"{name} ({std:.2g})" for name, std in stated.items() if 0.7 < std < 1.4]:
-        sentences.append(f"whether deviations of {', '.join(near)} are variances: both are near 1")
     return sentences
 
 

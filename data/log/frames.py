@@ -160,7 +160,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
     """
     base, used = Sensors(), set(rows["kind"])
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
-    rare = _lasting(rows, square, dt)
+    rare = _apart(rows, MOTION, dt) ** 0.5  # the error of a motion that is measured seldom lasts until the next
 
     def of(*names: str, default: float, unit: str) -> float:
         stated = stated_std(rows, *names)
@@ -203,7 +203,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         if any(member.shown for member in members):
             noise["velocity_reading"] = "fixes"
     elif {*MOTION}.isdisjoint(square.index):
-        ratio, floor = min(rare * base.velocity_std_ratio, 1.0), rare * base.velocity_floor
+        ratio, floor = base.velocity_std_ratio, base.velocity_floor
         summary.assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")
     else:
         floor = rare * of(*MOTION, default=0.0, unit="m/s")
@@ -225,27 +225,10 @@ def fix_factors(rows: Rows, ids: Sequence[str], steps: "Steps") -> Floats:
     return factor if (np.abs(np.log(factor)) > EQUAL_LOG_FACTOR).any() else np.empty(0)
 
 
-def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:
-    """Factor of the deviation of a motion that is measured seldom: its error lasts for the n steps until the next, or
-    for the m after which fixes have made up for it; the variances of so many are in one.
-
-    Where fixes of deviation r a step hold a walk of errors s dt, m sqrt(m) is r / (s dt).
-    """
-    base, pace = Sensors(), np.nan_to_num(_once(rows, MOTION)["value"].abs().mean())
-    motion, fix = np.sqrt([square.reindex(MOTION).mean(), square.get("x", np.nan)])
-    motion, fix = motion if motion > 0.0 else base.velocity_std_ratio * pace, fix if fix > 0.0 else base.gnss_std[0]
-    held = fix * _apart(rows, ["x"], dt) ** 0.5 / max(motion * dt, 1e-12)
-    return float(np.sqrt(min(max(held ** (2 / 3), 1.0), _apart(rows, MOTION, dt))))
-
-
-def _once(rows: Rows, kinds: Sequence[str]) -> Rows:
-    """One of these kinds for each vehicle and time."""
-    return only(rows, *kinds).drop_duplicates(["vehicle", "t"]).sort_values("t")
-
-
 def _apart(rows: Rows, kinds: Sequence[str], dt: float) -> float:
     """Steps from one measurement of these kinds to the next, 1 at least."""
-    return float(np.fmax(_once(rows, kinds).groupby("vehicle")["t"].diff().median() / dt, 1.0))
+    t = only(rows, *kinds).drop_duplicates(["vehicle", "t"]).sort_values("t").groupby("vehicle")["t"]
+    return float(np.fmax(t.diff().median() / dt, 1.0))
 
 
 def _across(speed: float, heading: float, rows: Rows, dt: float) -> float:

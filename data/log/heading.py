@@ -1,25 +1,27 @@
 """Headings of a member of a log: as they were measured, or by its course, or by gyro, odometer and fixes."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from coopoc.arrays import AnyArray, Floats
+from coopoc import PoseFilter, Sensors
+from coopoc.arrays import Floats
+from coopoc.evaluate.metrics import normalised_innovations
 from coopoc.world.links import wrap
 
-from ..assemble import SAME_INSTANT, covered
+from ..assemble import PLANE_STD, SAME_INSTANT, covered, planar_recording, steps_of
 
-BASELINE = 10.0
-"""Standard deviations of a fix, by which two must be apart to show a direction: to 0.14 rad."""
-TURNS = 7.5 / BASELINE
-"""Root of summed squared sines of turns above which their sense is no chance: fixes make 0.24 of it."""
-GYRO_BIAS, GYRO_LASTS, GYRO_WALK = 0.02, 600.0, 0.01
-"""rad/s, bias of a yaw rate, and s, for which it lasts; rad in a root of a second, by which its integral wanders."""
-FADES, SEEN = 20.0, 4.0
-"""s, in which fixes fade; standard deviations of a fix, by which two must be apart to show a direction as well as all
-must before they count: to 0.35 rad."""
+STEP, STARTS = 0.1, 4
+"""s, of the steps of the pose filters that find a heading, and directions from which they do."""
+SURE = 0.15
+"""rad, standard deviation of a heading below which it is one."""
+GYRO_BIAS, GYRO_WALK, SCALE = 0.02, 0.01, 0.03
+"""rad/s, bias of a yaw rate; rad in a root of a second, by which its integral wanders; share by which a speed errs."""
+MIRRORED = 0.5
+"""Of the squared innovations, that are left where yaw rates count the other way round."""
 
 HeadingAt = Callable[[Floats], Floats]
 
@@ -67,15 +69,10 @@ class Reckoning(NamedTuple):
     yaw_rate: Signal
     std: float
 
-    def ways(self) -> tuple[AnyArray, AnyArray]:
-        """Places x + iy m at the fixes by dead reckoning, and by them."""
-        angle = _angle(self.yaw_rate, self.speed.t)
-        way = Signal(self.speed.t, self.speed.value * np.column_stack([np.cos(angle), np.sin(angle)]))
-        return integral(way, self.fixes.t) @ [1, 1j], self.fixes.value[:, :2] @ [1, 1j]
-
     def parts(self, gap: float) -> "Iterator[Reckoning]":
         """Between gaps of the yaw rate, which nothing leads across."""
-        for t in np.split(self.yaw_rate.t, np.flatnonzero(np.diff(self.yaw_rate.t) > gap + SAME_INSTANT) + 1):
+        gaps = np.flatnonzero(np.diff(self.yaw_rate.t) > gap + SAME_INSTANT) + 1
+        for t in np.split(self.yaw_rate.t, gaps) if len(self.yaw_rate.t) > 1 else ():
             fixes, speed, rate = (
                 Signal(signal.t[inside], signal.value[inside])
                 for signal in (self.fixes, self.speed, self.yaw_rate)
@@ -83,16 +80,6 @@ class Reckoning(NamedTuple):
             )
             if min(len(fixes.t), len(speed.t), len(rate.t)) > 1:
                 yield Reckoning(fixes, speed, rate, self.std)
-
-    def far_apart(self) -> Iterator[tuple[int, int, complex, complex]]:
-        """Indices of fixes that are BASELINE standard deviations apart, and x + iy m by which they and dead reckoning
-        moved in between."""
-        (path, position), last = self.ways(), 0
-        for j in range(1, len(self.fixes.t)):
-            moved, driven = position[j] - position[last], path[j] - path[last]
-            if min(abs(moved), abs(driven)) >= BASELINE * self.std:
-                yield last, j, moved, driven
-                last = j
 
 
 def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:
@@ -130,96 +117,74 @@ def heading_of_courses(velocity: Signal, yaw_rate: Signal | None) -> HeadingAt:
     return lambda at: wrap(held(offset, at)[:, 0] + _angle(yaw_rate, at))
 
 
-def heading_of_rates(way: Reckoning, gap: float) -> Course | None:
-    """`heading_of_gyro`, else `heading_of_all`, anew behind each gap of the yaw rate that is longer than `gap` s."""
-    found = [(part, heading_of_gyro(part) or heading_of_all(part)) for part in way.parts(gap)]
-    courses = [(part.yaw_rate.t, course) for part, course in found if course is not None]
-    if not courses:
-        return None
+def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
+    """Heading of what measures speed and yaw rate alone, by `poses_of`, anew behind each gap of the yaw rate that is
+    longer than `gap` s; None if none is found. And whether yaw rates of the other sign fit fixes better by far.
 
-    def at(times: Floats) -> Floats:
-        angle = unknown(times)
-        for t, course in courses:
-            here = (times >= t[0] - 0.5 * gap) & (times <= t[-1] + 0.5 * gap)
-            angle[here] = course.at(times[here])
-        return angle
-
-    longest = max(courses, key=lambda each: len(each[0]))[1]
-    return longest._replace(at=at)
-
-
-def heading_of_gyro(way: Reckoning) -> Course | None:
-    """Heading of what measures speed and yaw rate alone: a Kalman filter of the heading at the start and of the yaw
-    rate's bias, NaN before the first. None if nothing moves far.
-
-    Fixes that are BASELINE standard deviations apart measure the angle by which the way between them is turned from
-    that of dead reckoning, in the middle of it; where angles scatter more than fixes explain, they weigh less.
-    """
-    t, state, cov, level, samples = way.fixes.t, np.zeros(2), np.zeros((2, 2)), 1.0, list[tuple[float, ...]]()
-    for last, j, moved, driven in way.far_apart():
-        angle, variance, since = np.angle(moved / driven), 2 * way.std**2 / abs(driven) ** 2, t[j] - t[last]
-        h = np.array([1.0, -0.5 * since])
-        if not samples:
-            state, cov = np.array([angle, 0.0]), np.diag([variance, GYRO_BIAS**2])
-        else:
-            later = t[j] - samples[-1][0]
-            ahead = np.array([[1.0, later], [0.0, 1.0]])
-            state, cov = ahead @ state, ahead @ cov @ ahead.T
-            cov += later * np.diag([GYRO_WALK**2, GYRO_BIAS**2 / GYRO_LASTS])
-            gap = wrap(angle - h @ state)
-            level += (max(gap**2 / (h @ cov @ h + variance), 0.5) - level) / 10
-            gain = cov @ h / (h @ cov @ h + max(level, 1.0) * variance)
-            state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
-        samples.append((float(t[j]), *state, cov[0, 0] * (abs(driven) / since) ** 2, since, cov[0, 0]))
-    if not samples:
-        return None
-    table = np.array(samples)
-
-    def at(times: Floats) -> Floats:
-        begun, offset, bias = held(Signal(table[:, 0], table), times).T[:3]
-        return np.asarray(wrap(offset + bias * (times - begun) + _angle(way.yaw_rate, times)))
-
-    wander, interval, variance = np.median(table[:, 3:], axis=0)
-    return Course(at, "fixes", float(wander * interval), float(np.sqrt(variance + GYRO_WALK**2 * interval)))
-
-
-def heading_of_all(way: Reckoning) -> Course | None:
-    """As `heading_of_gyro`, of what stays near: the turn of dead reckoning onto all fixes until then, which fade in
-    FADES s, by least squares; once it is as sure as by two that are SEEN standard deviations apart.
+    A heading that errs by s rad at a speed of v m/s makes the position wander, between fixes of r m that are T s apart,
+    by q m^2/s = (2 s^2 v^2)^(2/3) (r^2 T)^(1/3).
 
     >>> t = np.arange(0, 60, 0.5)
     >>> circle = 2.0 * np.column_stack([np.sin(0.2 * t), -np.cos(0.2 * t)])
     >>> way = Reckoning(Signal(t, circle), Signal(t, np.full((120, 1), 0.4)), Signal(t, np.full((120, 1), 0.2)), 1.0)
-    >>> heading_of_gyro(way) is None, heading_of_all(way).at(np.array([50.0])).round(2)  # 10 rad
-    (True, array([-2.57]))
+    >>> course, mirrored = heading_of_rates(way, 1.0)
+    >>> course.at(np.array([50.0])).round(1), mirrored  # 10 rad
+    (array([-2.6]), False)
     """
-    (path, position), t, sums, samples = way.ways(), way.fixes.t, np.zeros(5, complex), list[Floats]()
-    for j, (d, z) in enumerate(zip(path - path[:1], position - position[:1], strict=True)):
-        sums = sums * np.exp((t[max(j - 1, 0)] - t[j]) / FADES) + [1.0, d, z, abs(d) ** 2, z * d.conjugate()]
-        n, far, moved, square, product = sums
-        spread = (square - abs(far) ** 2 / n).real
-        turn = product - moved * far.conjugate() / n
-        if abs(turn) ** 2 >= 0.75 * (SEEN * way.std) ** 2 * spread and abs(turn) > 0.5 * spread:  # fixes move, too
-            samples.append(np.array([t[j], np.angle(turn), way.std**2 / spread]))
-    if not samples:
-        return None
-    since, pace = np.array(samples), np.median(np.abs(way.speed.value))
-    offset, variance = Signal(since[:, 0], since[:, 1:2]), float(np.median(since[:, 2]))
-    return Course(
-        lambda at: wrap(held(offset, at)[:, 0] + _angle(way.yaw_rate, at)),
-        "fixes",
-        variance * pace**2 * FADES,
-        float(np.sqrt(variance + GYRO_WALK**2 * FADES)),
+    found = [*map(poses_of, way.parts(gap))]
+    if not found:
+        return None, False
+    t, heading, variance, squares = (np.concatenate(each) for each in zip(*found, strict=True))
+    ours, others = squares.reshape(-1, 2).sum(axis=0)
+    known, rate = np.isfinite(heading), way.yaw_rate
+    if not known.any():
+        return None, False
+    offset = Signal(t, (heading - _angle(rate, t))[:, None])
+
+    def at(times: Floats) -> Floats:
+        angle = wrap(held(offset, times)[:, 0] + _angle(rate, times))
+        return np.where(covered(rate.t, times, gap, gap / 2), angle, np.nan)
+
+    s, pace = float(np.sqrt(np.median(variance[known]))), float(np.median(np.abs(way.speed.value)))
+    wanders = (2.0 * (s * pace) ** 2) ** (2 / 3) * (way.std**2 * float(np.median(np.diff(way.fixes.t)))) ** (1 / 3)
+    return Course(at, "fixes", wanders, s), bool(others < MIRRORED * ours)
+
+
+def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
+    """Times (M,) s and headings (M,) rad, NaN until one is SURE, of the pose filter whose innovations are the least
+    until then, of those that begin in STARTS directions; their variances (M,) rad^2; and the least sums (2,) of squared
+    innovations, with the yaw rates and with those of the other sign."""
+    fixes, speed, rate, std = way
+    t = np.arange(fixes.t[0], max(rate.t[-1], fixes.t[0] + STEP) + STEP, STEP)
+    sensors = Sensors(
+        gnss_std=(std, std, PLANE_STD),
+        yaw_rate_std=GYRO_WALK / STEP**0.5,
+        compass=False,
+        speed_scale_std=SCALE,
+        yaw_rate_bias_std=GYRO_BIAS,
     )
-
-
-def mirrored(way: Reckoning) -> bool:
-    """Whether dead reckoning turns to the other side than fixes do, from one span of `far_apart` to the next."""
-    spans = [(moved, driven) for _, _, moved, driven in way.far_apart()]
-    if len(spans) < 3:
-        return False
-    a, b = (np.sin(np.angle(ends[1:] * ends[:-1].conj())) for ends in np.array(spans).T)
-    return bool(a @ b < -max(0.5 * float(np.linalg.norm(a)), TURNS) * np.linalg.norm(b))
+    forward, turn = step_means(speed, t) * [1.0, 0.0], step_means(rate, t)
+    rec = planar_recording(("",), t, forward[:, None], turn, np.empty((0, 2)), np.empty((0, 5)), sensors, "")
+    step, _ = steps_of(fixes.t - t[0], STEP, len(t))
+    gnss = np.full_like(rec.gnss, np.nan)
+    gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
+    runs = np.arange(2 * STARTS)
+    rec = replace(rec, gnss=gnss).of_runs(0 * runs)
+    assert rec.body is not None
+    sign = np.where(runs < STARTS, 1.0, -1.0)[:, None, None]
+    rec = replace(rec, body=replace(rec.body, yaw_rate=sign * rec.body.yaw_rate))
+    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs, [0, 0, 0, 2 * np.pi / STARTS])
+    spread = std, std, PLANE_STD, np.pi / STARTS
+    track = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
+    squares = normalised_innovations(track, rec)
+    assert squares is not None
+    assert track.heading is not None
+    assert track.heading_covariance is not None
+    sums = np.nancumsum(squares[..., 0], axis=1)
+    best = sums[:STARTS].argmin(axis=0), np.arange(len(t))
+    heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
+    known = np.maximum.accumulate(variance < SURE**2)
+    return t, np.where(known, heading, np.nan), variance, sums[:, -1].reshape(2, -1).min(axis=1)
 
 
 def held(signal: Signal, at: Floats) -> Floats:
@@ -241,6 +206,18 @@ def integral(signal: Signal, at: Floats) -> Floats:
     value = np.pad(signal.value, ((1, 1), (0, 0)), "edge")
     path = scipy.interpolate.BSpline(np.pad(t, 1, "edge"), value, 1).antiderivative()
     return np.asarray(path(at - start) - path(0.0))
+
+
+def step_means(signal: Signal, grid: Floats) -> Floats:
+    """(T, C) mean over the step that ends at each instant, of the samples joined by straight lines.
+
+    >>> speed = Signal(np.array([0.0, 1]), np.array([[0.0], [2]]))
+    >>> step_means(speed, np.array([0.0, 0.5, 1])).ravel().tolist()
+    [0.0, 0.5, 1.5]
+    """
+    dt = grid[1] - grid[0]
+    means: Floats = np.diff(integral(signal, np.append(grid[0] - dt, grid)), axis=0) / dt
+    return means
 
 
 def _angle(yaw_rate: Signal | None, at: Floats) -> Floats:

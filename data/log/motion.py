@@ -21,8 +21,7 @@ from .heading import (
     heading_at,
     heading_of_courses,
     heading_of_rates,
-    integral,
-    mirrored,
+    step_means,
     unknown,
 )
 from .units import Rows, Summary, in_group, only, place
@@ -35,8 +34,6 @@ STANDS = 0.5
 """m/s, a speed below which what has no heading is taken to stand."""
 UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
-BETWEEN = (0.25, 0.5, 0.75)
-"""Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
 CLIMBS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """s, or halves of an interval of fixes that is longer, in which heights change where a road climbs."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
@@ -180,11 +177,11 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still)
     std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
-    shown = velocity_of_fixes(way, steps)
+    shown, (derived, mirrored) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing = _heading(measured, world, shown, way, ever)
+        pointing = _heading(measured, world, shown, derived, turn, ever)
         if pointing.at is unknown or not np.isfinite(off).all():
             raise InputError(
                 f"antenna of {name}",
@@ -198,7 +195,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         fixes = Signal(fixes.t, fixes.value - turned(off, angle))
         way = way._replace(fixes=fixes)
         shown = velocity_of_fixes(way, steps)
-    if len(speed.t) > 1 and len(turn.t) > 1 and mirrored(way):
+        derived, mirrored = heading_of_rates(way, steps.gap(turn.t))
+    if mirrored:
         summary.assume(CLOCKWISE, name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
@@ -211,13 +209,13 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
                 )
         summary.refuse("world velocities in body frames", only(rows, "vx", "vy", "vz"))
         signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
-        along = _heading(measured, None, shown, way, steps)
+        along = _heading(measured, None, shown, derived, turn, steps)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         moves: Floats = forward * turned(AHEAD, along.at(grid))
         velocity: Floats = forward * AHEAD
     else:
-        moved, times, heading = _in_world(name, rows, measured, shown, way, steps)
-        signals, rate = [times], none
+        moved, heading = _in_world(name, rows, measured, shown, derived, way, steps)
+        signals, rate = [moved or fixes], none
         velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
     there, by_fixes = _present(signals, steps), signals[0] is fixes
     held = _held(fixes, np.nan_to_num(moves), there, steps, again, way.std)
@@ -272,26 +270,23 @@ def climbing(fixes: Signal) -> float:
 
 
 def _in_world(
-    name: str, rows: Rows, measured: Signal, shown: Shown, way: Reckoning, steps: Steps
-) -> tuple[Signal | None, Signal, Course]:
-    """Velocity, None where the fixes have to show it; the samples that it is of; and the heading, by `measured` ones or
-    derived."""
+    name: str, rows: Rows, measured: Signal, shown: Shown, derived: Course | None, way: Reckoning, steps: Steps
+) -> tuple[Signal | None, Course]:
+    """Velocity, None where the fixes have to show it; and the heading, by `measured` ones or derived."""
     summary, speed = steps.summary, way.speed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), only(rows, "speed")
-    heading = _heading(measured, world, shown, way, steps)
+    heading = _heading(measured, world, shown, derived, way.yaw_rate, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
-        return Signal(world.t, np.nan_to_num(world.value)), world, heading._replace(wanders=0.0)
+        return Signal(world.t, np.nan_to_num(world.value)), heading._replace(wanders=0.0)
     if len(speed.t) and (heading.at is not unknown or abs(speed.value.mean()) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
-        at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
-        pace = np.interp(at, speed.t, speed.value[:, 0])
-        angle = heading.at(at)
-        kept, own = np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading.at is unknown), np.isin(at, speed.t)
-        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
-        velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading
+        angle = heading.at(speed.t)
+        kept = np.isfinite(angle) | (np.abs(speed.value[:, 0]) < STANDS) | (heading.at is unknown)
+        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~kept])])
+        velocity = speed.value * np.nan_to_num(turned(AHEAD, angle))
+        return Signal(speed.t[kept], velocity[kept]), heading
     if len(speed.t):
         raise InputError(
             f"{place(speeds)}, speed",
@@ -307,16 +302,18 @@ def _in_world(
             "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z.",
         )
     summary.assume(DERIVED, name)
-    return None, way.fixes, heading._replace(wanders=shown.wanders)
+    return None, heading._replace(wanders=shown.wanders)
 
 
-def _heading(measured: Signal, world: Signal | None, shown: Shown, way: Reckoning, steps: Steps) -> Course:
+def _heading(
+    measured: Signal, world: Signal | None, shown: Shown, derived: Course | None, turn: Signal, steps: Steps
+) -> Course:
     """Heading that was measured, else by the yaw rate and fixes, else the course of the velocities in the world that
     were measured, else of those that fixes have shown."""
-    rate = way.yaw_rate if len(way.yaw_rate.t) > 1 else None
+    rate = turn if len(turn.t) > 1 else None
     if len(measured.t):
         return Course(heading_at(measured, rate, steps.gap(measured.t)))
-    if rate is not None and len(way.speed.t) > 1 and (derived := heading_of_rates(way, steps.gap(rate.t))):
+    if derived is not None:
         return derived
     sources = [("fixes", shown)]
     if world is not None:
@@ -338,18 +335,6 @@ def _longest(there: Bools, grid: Floats) -> str:
         return ""
     k = np.argmax(gaps)
     return f", longest gap {gaps[k]:.1f} s from {grid[at[k]] - grid[0]:.1f} s on"
-
-
-def step_means(signal: Signal, grid: Floats) -> Floats:
-    """(T, C) mean over the step that ends at each instant, of the samples joined by straight lines.
-
-    >>> speed = Signal(np.array([0.0, 1]), np.array([[0.0], [2]]))
-    >>> step_means(speed, np.array([0.0, 0.5, 1])).ravel().tolist()
-    [0.0, 0.5, 1.5]
-    """
-    dt = grid[1] - grid[0]
-    means: Floats = np.diff(integral(signal, np.append(grid[0] - dt, grid)), axis=0) / dt
-    return means
 
 
 def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:

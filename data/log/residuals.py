@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
+from coopoc import InputError, Kalman, PoseFilter, Recording, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.poses.pose_inputs import SPREAD
@@ -42,8 +42,6 @@ class Check:
             each clock, and of what follows.
         ranges: share by which they are too long, s by which they are late, 0 where not sure; each with its standard
             error.
-        scored: x and variance that are held against the truth: in body frames those of the whole fleet's filter, since
-            one anchor alone leaves a vehicle's states open.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
@@ -63,7 +61,6 @@ class Check:
     ahead: Floats
     unsure: Floats
     slack: Floats
-    scored: tuple[Floats, Floats]
     ranges: tuple[tuple[float, float], ...] = ()
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
@@ -139,7 +136,6 @@ def filtered(log: Log) -> Check:
     normalised, heading, heading_variance = np.full((steps, vehicles), np.nan), *np.zeros((2, steps, vehicles))
     marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), np.inf)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
-    scored = x, variance
     if rec.body is None:
         followed = [column for column in range(vehicles) if rec.stretches(column)]
         if not followed:
@@ -148,15 +144,11 @@ def filtered(log: Log) -> Check:
         track = Kalman(robust=False)(rec, followed)
     else:
         begin, spread, start = begin_of(log)
-        filter_ = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)
-        track = filter_(rec, _moving(rec))
-        if log.truth is not None:
-            fleet = replace(filter_, unit="fleet")(rec, _moving(rec))
-            scored = x.copy(), variance.copy()
-            scored[0][:, fleet.egos], scored[1][:, fleet.egos] = fleet.x[0], _variance(fleet)
+        track = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)(rec, _moving(rec))
     columns, squares = list(track.egos), normalised_innovations(track, rec)
     assert squares is not None
-    x[:, columns], variance[:, columns] = track.x[0], _variance(track)
+    assert track.covariance is not None
+    x[:, columns], variance[:, columns] = track.x[0], np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
     fix[:, columns], normalised[:, columns] = fix_innovations(track, rec)[0], squares[0]
     for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
         lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]
@@ -174,13 +166,7 @@ def filtered(log: Log) -> Check:
     log = replace(log, recording=rec)
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
-    return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)), scored)
-
-
-def _variance(track: Track) -> Floats:
-    """(T, E, 3) m^2, in the first run."""
-    assert track.covariance is not None
-    return np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
+    return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)))
 
 
 def plane(vectors: Floats) -> AnyArray:
