@@ -129,24 +129,29 @@ def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     return np.asarray(of_step.take(at, axis))
 
 
-def moves(c: Check, column: int) -> AnyArray:
+def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     """(5, M) displacements m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
     that stands still, the fixes) moves far; by what velocity and acceleration change over a span, as fixes are off that
-    are late, or smoothed; and how long it is, s. M = 0 where too little moves."""
+    are late, or smoothed; and how long it is, s. M = 0 where too little moves. On a short way the means of several
+    fixes are less noisy."""
     rec = c.world
     fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     walk = rec.dt * np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor))
     at = np.flatnonzero(np.isfinite(fixes))
+    parts = at[: len(at) // means * means].reshape(-1, means)
+    parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
     pace = np.gradient(path, rec.dt)
-    numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, at]
-    (fixes, path), gaps = numbers[:2], gaps[at]
-    for places, far in ((path, MOVED_STDS), (fixes, 2 * MOVED_STDS)):
+    numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(axis=2)
+    (fixes, path), gaps, at = numbers[:2], gaps[parts[:, 0]], parts[:, 0]
+    times = MOVED_STDS if means == 1 else MOVED_STDS / 3
+    noise = c.fix_noise / means**0.5
+    for places, far in ((path, times), (fixes, 2 * times)):
         pairs, last = [], 0
         for k in range(1, len(at)):
             if gaps[k] != gaps[last]:
                 last = k
-            elif abs(places[k] - places[last]) > max(far * c.fix_noise, OUTLYING * walk * (at[k] - at[last]) ** 0.5):
+            elif abs(places[k] - places[last]) > max(far * noise, OUTLYING * walk * (at[k] - at[last]) ** 0.5):
                 pairs.append((last, k))
                 last = k
         if len(pairs) >= 3:
@@ -183,6 +188,9 @@ def odometry(c: Check, column: int) -> Estimate:
         return Estimate(value, np.hypot(error, [attenuation, 0.0, 0.0, 0.0, 0.0]))
     if truth is None:
         moved, driven, turns, bends, span = moves(c, column)
+        if len(moved) < LEAST_COUNT:
+            means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2)
+            moved, driven, turns, bends, span = moves(c, column, max(means, 2))
         square = max(np.square(np.abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
         value, error = _of_motion(moved - driven, causes, span, 2**0.5 * c.fix_noise)
