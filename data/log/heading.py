@@ -9,13 +9,15 @@ import scipy
 
 from coopoc import PoseFilter, Sensors
 from coopoc.arrays import Floats
-from coopoc.evaluate.metrics import normalised_innovations
+from coopoc.evaluate.metrics import fix_innovations
 from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD, SAME_INSTANT, covered, planar_recording, steps_of
 
 STEP, STARTS = 0.1, 4
 """s, of the steps of the pose filters that find a heading, and directions from which they do."""
+PER_SAMPLE, MOST_STEPS = 20, 100_000
+"""Steps for each sample of a yaw rate, and in all, beyond which they are longer."""
 SURE = 0.15
 """rad, standard deviation of a heading below which it is one."""
 GYRO_BIAS, GYRO_WALK, SCALE = 0.02, 0.01, 0.03
@@ -153,19 +155,21 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     """Times (M,) s and headings (M,) rad, NaN until one is SURE, of the pose filter whose innovations are the least
     until then, of those that begin in STARTS directions; their variances (M,) rad^2; and the least sums (2,) of squared
-    innovations, with the yaw rates and with those of the other sign."""
+    innovations over their variances, with the yaw rates and with those of the other sign."""
     fixes, speed, rate, std = way
-    t = np.arange(fixes.t[0], max(rate.t[-1], fixes.t[0] + STEP) + STEP, STEP)
+    span = max(float(rate.t[-1] - fixes.t[0]), STEP)
+    dt = max(STEP, span / min(PER_SAMPLE * len(rate.t), MOST_STEPS))
+    t = np.arange(fixes.t[0], fixes.t[0] + span + dt, dt)
     sensors = Sensors(
         gnss_std=(std, std, PLANE_STD),
-        yaw_rate_std=GYRO_WALK / STEP**0.5,
+        yaw_rate_std=GYRO_WALK / dt**0.5,
         compass=False,
         speed_scale_std=SCALE,
         yaw_rate_bias_std=GYRO_BIAS,
     )
     forward, turn = step_means(speed, t) * [1.0, 0.0], step_means(rate, t)
     rec = planar_recording(("",), t, forward[:, None], turn, np.empty((0, 2)), np.empty((0, 5)), sensors, "")
-    step, _ = steps_of(fixes.t - t[0], STEP, len(t))
+    step, _ = steps_of(fixes.t - t[0], dt, len(t))
     gnss = np.full_like(rec.gnss, np.nan)
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
     runs = np.arange(2 * STARTS)
@@ -176,11 +180,11 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs, [0, 0, 0, 2 * np.pi / STARTS])
     spread = std, std, PLANE_STD, np.pi / STARTS
     track = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
-    squares = normalised_innovations(track, rec)
-    assert squares is not None
+    assert track.covariance is not None
     assert track.heading is not None
     assert track.heading_covariance is not None
-    sums = np.nancumsum(squares[..., 0], axis=1)
+    known = 2.0 * std**2 + np.trace(track.covariance[:, :, 0, :2, :2], axis1=2, axis2=3)
+    sums = np.nancumsum(np.square(fix_innovations(track, rec)[:, :, 0]).sum(axis=-1) / known, axis=1)
     best = sums[:STARTS].argmin(axis=0), np.arange(len(t))
     heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
     known = np.maximum.accumulate(variance < SURE**2)
