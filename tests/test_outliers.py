@@ -67,6 +67,8 @@ def test_outliers_are_added_to_the_clean_draws(crossing, frame):
     assert np.nanmax(jump) < 50.0 + 1e-9
     assert not np.isnan(bad.gnss[:, 0]).any()
     assert np.array_equal(bad.gnss[:, 0], clean.gnss[:, 0])
+    everywhere = seen(crossing, Outliers(fixes=Fault(1.0, (10.0, 10.0))), frame=frame, runs=20).gnss - clean.gnss
+    assert np.abs(everywhere[:, 1:].mean(axis=(0, 1, 2))).max() < 0.3  # of 10 m in any direction
     slip = bad.velocity - clean.velocity
     assert abs((np.abs(slip).max(axis=-1) > 1e-9).mean() - 0.1) < 0.03
     assert bad.sensors == clean.sensors
