@@ -11,7 +11,7 @@ from ..assess.assess import squared
 from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
 from ..model.space import nearest_rotation
-from .graph_starts import crossings, parts
+from .graph_starts import parts
 
 RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
@@ -19,6 +19,8 @@ LEVEL = "bearing", "azimuth"
 """Kinds whose measurements of a node in space fit its mirror image at a level plane as well."""
 PATH_NODES = 2000
 """Nodes up to which all shortest paths are taken."""
+CUT_SPHERES = 12
+"""Of the ranges of a point, whose spheres are cut."""
 MAX_DESCENTS = 32
 """Moves that are followed by descents, of few bodies and the most promising first."""
 DOUBTED_COST, TRIED_COST = 10.0, 100.0
@@ -135,6 +137,25 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     return found
 
 
+def crossings(places: Floats, ranges: Floats) -> Floats:
+    """(C, d) points where d of the spheres of `ranges` (K,) around `places` (K, d) meet, or come nearest to it; of many
+    some are cut that are spread over all.
+
+    >>> crossings(np.array([[0.0, 0], [8, 0]]), np.array([5.0, 5])).round(6)
+    array([[ 4., -3.],
+           [ 4.,  3.]])
+    """
+    d, few = places.shape[1], np.unique(np.linspace(0, len(places) - 1, CUT_SPHERES).round().astype(np.int64))
+    chosen = np.array([*combinations(few, d)])
+    p, r = places[chosen], ranges[chosen]
+    gap = p[:, 1:] - p[:, :1]
+    right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
+    foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
+    height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
+    up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
+    return np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d)
+
+
 def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
     """Nodes (K, ambient) moved as a rigid body as near as possible to their image at the best-fit plane of places
     (K, d), keeping their handedness."""
@@ -166,15 +187,17 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
         """(C,) of places (C, K, d) of the body."""
         return ranges.cost(np.linalg.norm(at[:, index] - places, axis=2).T, rows)
 
+    def apart(a: Floats, b: Floats) -> Bools:
+        return np.asarray(np.linalg.norm(a - b, axis=-1).max(axis=-1) > least)
+
     ends = [_mirrored(ranges.problem, x[body], places)]
     if len(body) == 1 and len(rows) >= space.dimension:
-        met = crossings(places, ranges.distance[rows])[:, None]
-        ends.append(
-            space.join(met[np.where(np.linalg.norm(met - at, axis=2)[:, 0] > least, costs(met), np.inf).argmin()])
-        )
+        met = np.concatenate([space.position(np.stack(ends)), crossings(places, ranges.distance[rows])[:, None]])
+        best = met[np.where(apart(met, at), costs(met), np.inf).argmin()]
+        ends += [space.join(best)] * bool(apart(best, met[0]))
     moved = np.stack([space.position(end) for end in ends])
-    far, adds = np.linalg.norm(moved - at, axis=2).max(axis=1) > least, costs(moved) - costs(at[None])
-    return [(add, end, body) for add, end, there in zip(adds.tolist(), ends, far, strict=True) if there]
+    adds = costs(moved) - costs(at[None])
+    return [(add, end, body) for add, end, far in zip(adds.tolist(), ends, apart(moved, at), strict=True) if far]
 
 
 def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
