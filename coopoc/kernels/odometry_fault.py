@@ -40,8 +40,8 @@ DECISIVE, MAX_EVIDENCE = 15.0, 18.0
 """Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
 ERRS_SHARE, ERRS_RATE, ERRS_STDS, ERRS_SECONDS = 0.2, 0.5, 5.0, 2.0
 """Of the way, m for each second, and deviations of a fix: it errs by as much at least, for as many s."""
-FASTER = 2.0
-"""Times the fastest by odometry that a vehicle may go, if that is above ERRS_RATE."""
+FASTER = 4.0
+"""Times the fastest by odometry that a vehicle may go, if that is above ERRS_RATE: m/s for km/h make it 3.6."""
 WANDERS = 2.0
 """s, in which the errors of all fixes may change together."""
 NOISIER, UNKNOWN = 0.1, 4.0

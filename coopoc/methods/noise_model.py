@@ -140,10 +140,8 @@ class NoiseModel:
             first: step at which the filter begins.
         """
         if self.extra is not None:
-            more = np.zeros(self.extra.shape)
-            own = slice(None) if columns is None else columns
-            more[:, :, own] = self.extra[:, :, own]  # a vehicle knows of no other's
-            more = more[:, :, own] if inbox is None else more
+            # of neighbours, too: what they send of fixes and velocities shows the same to who receives it
+            more = self.extra if columns is None or inbox is not None else self.extra[:, :, columns]
             return replace(self, extra=None).process_variance(recording, columns, inbox, first) + more[..., None]
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
