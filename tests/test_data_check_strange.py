@@ -146,3 +146,22 @@ def test_odometry_of_one_that_errs_is_no_clock_of_others(tmp_path, pace, factor,
     assert re.findall(rf"(\w): its odometry is {words}", text) == ["b"]
     assert text.count("its odometry") == 1
     assert "clock=" not in text
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("reverses", r"car1: its odometry .*fixes go back on [12]\d% of the way"),
+        ("spins", r"car1: its odometry fails, .*6\d to 9\d s"),
+    ],
+)
+def test_odometry_that_fails_in_a_part_is_no_fault_of_others(tmp_path, fault, words):
+    """A car that reverses or slips for 30 s: clocks, scales and outliers of others were named for it."""
+    folder = strange(tmp_path / "log", "car", 1)
+    log = pd.read_csv(folder / "log.csv")
+    part = (log["vehicle"] == "car1") & log["t"].between(60, 90)
+    back, spins = part * (fault == "reverses"), part * (fault == "spins")
+    log.assign(heading=log["heading"] + np.pi * back, speed=log["speed"] * (1 + spins)).to_csv(folder / "log.csv")
+    text = said(folder)
+    assert re.search(words, text), text
+    assert not re.search("clock=|scale|outliers|NIS|ranges|car[023]:", text)

@@ -10,6 +10,8 @@ import scipy  # its statistics take half a second, and are imported where they a
 
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import dimensions
+from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.odometry_fault import with_odometry
 
 from .estimates import (
     BEHIND,
@@ -36,13 +38,19 @@ from .estimates import (
 from .estimates import median as median_of
 from .motion import CLOCKWISE, HOLDS
 from .read import Log
-from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, long_off, measurements, of_measurements, of_ranges, when
+from .relative import (
+    LEAST_OUTLIERS,
+    OUTLIER_SHARE,
+    measurements,
+    of_measurements,
+    of_ranges,
+)
 from .residuals import Check, filtered
 
 MISTAKEN = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
     (0.2, 0.4, "Is speed in km/h? Name it speed_kmh. Or in feet a second? Speeds are in m/s."),
-    (0.42, 0.55, "Is speed in miles an hour, or in knots? Speeds are in m/s."),
+    (0.42, 0.55, "Is speed in knots? Name it speed_knots. Or in miles an hour? Speeds are in m/s."),
     (3.0, 3.6, "Are positions in feet? They are in m."),
 )
 """Ratios of the distance of fixes to that of odometry (least, largest), and the unit that explains them."""
@@ -88,8 +96,10 @@ def check(log: Log) -> Check:
             that are not known.
     """
     first = filtered(log)
+    first = replace(first, failing=_failing(first) if log.recording.body is None else {})
     rows = _vehicles(first)
-    errs, drifts = ([first.world.ids.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
+    wrong = ([row["vehicle"] for row in rows if off(row) or row["vehicle"] in first.failing] for off in (_off, _drifts))
+    errs, drifts = ([*map(first.world.ids.index, names)] for names in wrong)
     result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
     result = replace(result, vehicles=_vehicles(result))
     if log.truth is not None and not any(_late(first, row) for row in result.vehicles) and not result.slack.any():
@@ -99,6 +109,12 @@ def check(log: Log) -> Check:
     result = replace(result, measurements=measurements(result))
     sentences = tuple(sentence for rule in CHECKS for sentence in rule(result))
     return replace(result, warnings=sentences, unseen=tuple(_unseen(result)))
+
+
+def _failing(c: Check) -> dict[str, str]:
+    """Vehicles whose odometry fixes correct, and when."""
+    noise = with_odometry(c.world, range(len(c.world.ids)), NoiseModel.nominal(c.world.sensors))[1]
+    return dict(note.removeprefix("odometry, ").split(": ", 1) for note in noise.notes if note.startswith("odometry, "))
 
 
 def _without(c: Check, columns: Sequence[int]) -> Check:
@@ -229,6 +245,8 @@ def _of_vehicles(c: Check) -> list[str]:
         if len(square) > LEAST_COUNT:
             usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04)
             outliers = np.mean(square > OUTLYING**2 * usual)
+        if name in c.failing:
+            nis, outliers = None, 0.0
         if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / max(len(square), 1)):
             sentences.append(
                 f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
@@ -236,11 +254,9 @@ def _of_vehicles(c: Check) -> list[str]:
             )
         if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= 2:
             word = "larger" if nis > 2 else "smaller"
-            part = when((c.world.t - c.world.t[0])[there], long_off(square / size))
-            cause = f"Most are{part}: is one of the two held?" if part else "Give std columns or sensors=."
             sentences.append(
                 f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "
-                f"or correlated in time. {cause}"
+                "or correlated in time. Give std columns or sensors=."
             )
         axes = _axes(c, column)
         sentences += [f"{name}: {axes}"] * bool(axes)
@@ -263,6 +279,13 @@ def _of_vehicles(c: Check) -> list[str]:
         if distance is not None and not 0.8 <= distance <= 1.25:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
             sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
+        elif name in c.failing:
+            moved, driven, *_ = moves(c, column)
+            back = np.abs(moved + driven) < 0.5 * np.abs(moved)
+            cause = "slips, or a speed or heading that is held or wrong."
+            if back.sum() >= 3:
+                cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
+            sentences.append(f"{name}: its odometry {c.failing[name]}: {cause}")
         elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
             sentences.append(
                 f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "

@@ -1,7 +1,7 @@
 """A log against a filter of each vehicle alone: innovations of fixes, residuals of relative measurements."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ class Check:
             each clock, and of what follows.
         ranges: share by which they are too long, s by which they are late, 0 where not sure; each with its standard
             error.
+        failing: vehicles whose odometry fixes correct -> what is said of it.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
@@ -62,6 +63,7 @@ class Check:
     unsure: Floats
     slack: Floats
     ranges: tuple[tuple[float, float], ...] = ()
+    failing: Mapping[str, str] = field(default_factory=dict)
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
