@@ -307,12 +307,14 @@ def test_the_mean_over_a_step_is_that_over_its_halves(seed):
 
 
 def test_deviations_are_stated_in_any_unit(tmp_path):
-    """The closed form: 3.6 km/h are 1 m/s, and those of a latitude are m."""
-    rows = "t,vehicle,latitude,longitude,height,speed_kmh,compass_deg\n"
-    rows += "".join(f"{k},a,48,{11 + 1e-5 * k},1,3,90\n" for k in range(9))
-    (tmp_path / "a.csv").write_text(rows)
-    found = load_log(f"{tmp_path}?std=latitude:2,longitude:1,height:3,speed_kmh:3.6").recording.sensors
-    assert (found.gnss_std, found.velocity_floor) == ((1.0, 2.0, 3.0), pytest.approx(1.0))
+    """The closed form: 3.6 km/h are 1 m/s, a knot is 1852 m an hour, and those of a latitude are m."""
+    for speed, std in {"speed_kmh": 3.6, "speed_knots": 3600 / 1852}.items():
+        rows = f"t,vehicle,latitude,longitude,height,{speed},compass_deg\n"
+        rows += "".join(f"{k},a,48,{11 + 1e-5 * k},1,{std},90\n" for k in range(9))
+        (tmp_path / "a.csv").write_text(rows)
+        found = load_log(f"{tmp_path}?std=latitude:2,longitude:1,height:3,{speed}:{std}").recording
+        assert (found.sensors.gnss_std, found.sensors.velocity_floor) == ((1.0, 2.0, 3.0), pytest.approx(1.0))
+        assert_allclose(found.velocity[0, :, 0, 0], 1.0)
 
 
 def test_a_radars_range_is_not_known_to_its_partner(tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.read import read_log
@@ -244,14 +245,14 @@ def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
     assert len(wide.recording.links) == 6 * len(t)
 
 
-@pytest.mark.parametrize("period", [86400, 604800])
+@pytest.mark.parametrize("period", [86400, 604800, 4294967.296, 619315200])
 def test_clocks_that_begin_anew_go_on(tmp_path, period):
-    """Seconds of the day at midnight, of the GPS week at its end: the file with stamps that go on is the reference. One
-    vehicle comes after the turn, one cell per object of JSON and per cell of CSV."""
+    """Seconds of the day at midnight, of the GPS week at its end, milliseconds of 32 bits, weeks of ten: the file with
+    stamps that go on is the reference. One vehicle comes after the turn, one cell per object of JSON and of CSV."""
     t, rows = period - 10 + np.arange(0, 20, 0.5), []
     for now in t.tolist():
-        rows += [{"t": now, "vehicle": "a", "x": 8 * now, "y": 0.0, "vx": 8.0, "vy": 0.0}]
-        rows += [{"t": now, "vehicle": "b", "x": 8 * now, "y": 5.0, "vx": 8.0, "vy": 0.0}] * (now > period + 2)
+        at = {"t": now, "x": 8 * (now - period), "vx": 8.0, "vy": 0.0}
+        rows += [{**at, "vehicle": "a", "y": 0.0}, *[{**at, "vehicle": "b", "y": 5.0}] * (now > period + 2)]
     plain, anew = (pd.DataFrame(rows) for _ in "ab")
     anew["t"] %= period
     plain.to_csv(tmp_path / "plain.csv", index=False)
@@ -262,7 +263,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
         f"stamps begin anew after {period} s: those before half of it count on"
     }
     after, file = plain["t"] >= period, tmp_path / "truth.csv"
-    for truth in (plain, anew, anew[after]):
+    for truth in (plain, anew, *[anew[after]] * (period % 86400 == 0)):
         truth.drop(columns=["vx", "vy"]).to_csv(file, index=False)
         for name, log in (("plain.csv", one), ("anew.jsonl", other)):
             actual = load_log(f"{tmp_path / name}?truth={file}").truth
@@ -338,7 +339,7 @@ def test_places_need_no_times(tmp_path):
         (tmp_path / name / "log.csv").write_text("\n".join([head, *rows]))
     (tmp_path / "a" / "mast.csv").write_text(f"t,vehicle,x,y,z\n{begin},mast,5,6,0\n")
     (tmp_path / "b" / "mast.csv").write_text("vehicle,x,y,z\nmast,5,6,0\n")
-    a, b = (co.read_log(tmp_path / name) for name in "ab")
+    a, b = (read_log(tmp_path / name) for name in "ab")
     assert same(a.recording, b.recording)
     assert "mast" in b.recording.ids
     assert any("without times" in text for text in b.summary.assumed)
@@ -374,3 +375,15 @@ def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
     car.to_csv(tmp_path / "a" / "car.csv", index=False)
     with refused("heading = [78]: must be within"):
         read_log(tmp_path / "a")
+
+
+def test_ranges_that_end_at_the_most_that_is_measured_are_left_out(tmp_path):
+    """The same log without them is the reference."""
+    rows, far = pd.read_csv(strange(tmp_path / "a", "drone") / "log.csv"), 60.0
+    (tmp_path / "b").mkdir()
+    rows.assign(range=rows["range"].clip(upper=far)).to_csv(tmp_path / "a" / "log.csv", index=False)
+    rows[~rows["range"].ge(far)].to_csv(tmp_path / "b" / "log.csv", index=False)
+    one, other = (read_log(tmp_path / name) for name in "ab")
+    assert 100 < len(other.recording.links) < 0.9 * rows["range"].count()
+    assert same(one.recording, other.recording)
+    assert "at the most that is measured, of what is further away" in str(one.summary)

@@ -23,8 +23,9 @@ UNSTATED = "standard deviations of {}: none was logged"
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
-PERIODS = 86400.0, 604800.0
-"""s, of clocks: a day, a GPS week."""
+WEEK = 604800.0
+PERIODS = WEEK / 7, WEEK, 2**32 / 1000, 1024 * WEEK
+"""s, after which clocks begin anew: a day, a GPS week, 32 bits of milliseconds, and the number of a week."""
 SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
@@ -40,17 +41,16 @@ HEADING_STD = 0.05
 
 
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
-    """Rows whose stamps go on where those of a vehicle begin anew, at midnight or at the end of a GPS week; those of
-    another file, such as the truth, may count on."""
+    """Rows whose stamps go on where those of a vehicle begin anew after one of PERIODS; those of another file, such as
+    the truth, may count on."""
     t = rows["t"]
     back = t < rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
     last = rows.groupby(["file", "vehicle"], sort=False)["t"].shift()
     for period in PERIODS:
-        inside = t.dropna().between(0, 1.25 * period)
-        away = t.between(0.25 * period, 0.75 * period)
-        if (t < last - 0.9 * period).any() and inside.all() and not away.any():
-            summary.assume(f"stamps begin anew after {period:g} s: those before half of it count on")
-            early = {name: rows[name].mask(rows[name] < period / 2, rows[name] + period) for name in ("t", "arrival")}
+        part = (t - last[(last - t).between(0.9 * period, 1.1 * period)].max()) / period + 1.0
+        if part.between(-0.25, 1.25)[t.notna()].all() and not part.between(0.25, 0.75).any():
+            summary.assume(f"stamps begin anew after {period:.10g} s: those before half of it count on")
+            early = {name: rows[name].mask(part < 0.5, rows[name] + period) for name in ("t", "arrival")}
             return rows.assign(**early)
     if 0 < back.mean() < DISORDER_SHARE:
         who = ", ".join(rows["vehicle"][back].unique())

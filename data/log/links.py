@@ -151,9 +151,10 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     table = table[~again]
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
     std = stated_std(fixes, "x", "y")
-    moved, vague = _to_step(table, members, steps, APART * (std if std > 0.0 else Sensors().gnss_std[0]))
+    moved, vague, full = _to_step(table, members, steps, APART * (std if std > 0.0 else Sensors().gnss_std[0]))
     summary.refuse("relative measurements off the steps, of what is too near", table[vague])
-    kept: pd.DataFrame = table.assign(value=moved).loc[~vague, [*PAIR, "component", "value"]]
+    summary.refuse("relative measurements at the most that is measured, of what is further away", table[full])
+    kept: pd.DataFrame = table.assign(value=moved).loc[~vague & ~full, [*PAIR, "component", "value"]]
     for word, number in zip(words, np.bincount(kept["component"], minlength=3).tolist(), strict=True):
         summary.count(word, number)
     return kept
@@ -181,12 +182,15 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     return table.groupby(PAIR)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
-def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, std: float) -> tuple[Floats, Bools]:
+def _to_step(
+    table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, std: float
+) -> tuple[Floats, Bools, Bools]:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
     their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_RATIO times
     lag du. Nothing is moved where g or du is not known. In body frames a bearing grows by lag w, too, with the
-    observer's yaw rate w.
+    observer's yaw rate w. And which are as long as the longest range, where most of these fall short of g by more
+    than `std`.
     """
     velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
@@ -208,7 +212,10 @@ def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, s
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
     distance = np.where(component == 0, value, np.inf)
-    gap, moved = np.minimum(np.linalg.norm(now, axis=1), distance), np.linalg.norm(now - then, axis=1)
+    away = np.linalg.norm(now, axis=1)
+    full = (component == 0) & (value == value[component == 0].max(initial=0.0))
+    full &= full.any() and np.median(np.nan_to_num(away - value)[full]) > std
+    gap, moved = np.minimum(away, distance), np.linalg.norm(now - then, axis=1)
     vague = (gap <= NEAR_RATIO * moved) & (gap <= std)
     value = value + np.where(vague, 0.0, np.nan_to_num(change[np.arange(len(change)), component]))
-    return np.where(component == 1, wrap(value), value), vague
+    return np.where(component == 1, wrap(value), value), vague, full

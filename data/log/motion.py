@@ -88,8 +88,9 @@ class Steps(NamedTuple):
         return longest_gap(t, self.dt, self.max_gap)
 
     def nearest(self, t: Floats) -> tuple[Ints, Floats]:
-        """Nearest step of each time (M,) s, -1 outside, and how much later than the step the time is, s."""
-        step, _ = steps_of(t - self.grid[0], self.dt, len(self.grid))
+        """Nearest step of each time (M,) s, of two the later one, -1 outside, and how much later than the step the time
+        is, s."""
+        step, _ = steps_of(t - self.grid[0] + SAME_INSTANT, self.dt, len(self.grid))
         return step, t - self.grid[step]
 
 

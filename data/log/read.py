@@ -18,7 +18,16 @@ from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED
 
-from ..assemble import backward_difference, check_scale, check_size, check_time, covered, interpolate, longest_gap
+from ..assemble import (
+    SAME_INSTANT,
+    backward_difference,
+    check_scale,
+    check_size,
+    check_time,
+    covered,
+    interpolate,
+    longest_gap,
+)
 from ..bag import is_topic, read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
@@ -445,10 +454,10 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
-            steps = at.assign(t=((at["t"] - t.min()) / step).round())
-            return float(steps.duplicated(["vehicle", "t"]).mean())
+            steps = at.assign(t=((at["t"] - t.min() + SAME_INSTANT) / step).round())
+            return max(float(steps.duplicated(["vehicle", "t"]).mean()), LOST)
 
-        parts = next((n for n in (1, 2, 3, 4, 5) if lost(step / n) <= LOST), 1)
+        parts = min((1, 2, 3, 4, 5), key=lambda n: lost(step / n))
         if parts > 1:
             step = float(f"{step / parts:.3g}")
             summary.assume(f"steps of {step:g} s, since fixes come at two rates or more")

@@ -36,6 +36,7 @@ KINDS: dict[str, Kind] = {
     "longitude": Kind("fix", "longitude", 180.0),
     **{name: Kind("odometry", name, 500.0) for name in ("vx", "vy", "vz", "speed")},
     "speed_kmh": Kind("odometry", "speed", 1800.0, 1 / 3.6),
+    "speed_knots": Kind("odometry", "speed", 972.0, 1.852 / 3.6),
     "yaw_rate": Kind("odometry", "yaw_rate", 35.0),
     "heading": Kind("heading", "heading", TURN),
     "range": Kind("relative", "range"),
