@@ -100,8 +100,8 @@ GRAPH = Graph(
 
 
 def test_a_file_of_another_format_is_refused(tmp_path):
-    _assert_refused(lambda: load_graph(tmp_path / "a"), "path = a", ".pyfg or .g2o")
-    _assert_refused(lambda: load_graph(tmp_path / "a.pfg"), "path = a.pfg", "Did you mean .pyfg?")
+    _assert_refused(lambda: load_graph(tmp_path / "a"), "/a: must end in .pyfg or .g2o")
+    _assert_refused(lambda: load_graph(tmp_path / "a.pfg"), "/a.pfg: must", "Did you mean .pyfg?")
     _assert_refused(lambda: load_graph(tmp_path / "none.g2o"), "none.g2o", "must be a file")
     assert not list(tmp_path.iterdir())
 

@@ -493,5 +493,6 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     whole = np.zeros((len(wanted), len(wanted)))
     unit = np.zeros((system.size, len(moving)))
     unit[wanted[moving], np.arange(len(moving))] = 1.0
-    whole[np.ix_(moving, moving)] = columns_solved(system.cholesky, unit)[wanted[moving]]
+    if len(moving):
+        whole[np.ix_(moving, moving)] = columns_solved(system.cholesky, unit)[wanted[moving]]
     return whole.reshape(len(places), dof, len(places), dof).swapaxes(1, 2)
