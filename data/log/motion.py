@@ -26,6 +26,8 @@ from .heading import (
 )
 from .units import Rows, Summary, in_group, only, place
 
+BETWEEN = (0.25, 0.5, 0.75)
+"""Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
 SHOWN_STDS = 3.0
@@ -215,8 +217,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         moves: Floats = forward * turned(AHEAD, along.at(grid))
         velocity: Floats = forward * AHEAD
     else:
-        moved, heading = _in_world(name, rows, measured, shown, derived, way, steps)
-        signals, rate = [moved or fixes], none
+        moved, times, heading = _in_world(name, rows, measured, shown, derived, way, steps)
+        signals, rate = [times], none
         velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
     there, by_fixes = _present(signals, steps), signals[0] is fixes
     held = _held(fixes, np.nan_to_num(moves), there, steps, again, way.std)
@@ -272,22 +274,25 @@ def climbing(fixes: Signal) -> float:
 
 def _in_world(
     name: str, rows: Rows, measured: Signal, shown: Shown, derived: Course | None, way: Reckoning, steps: Steps
-) -> tuple[Signal | None, Course]:
-    """Velocity, None where the fixes have to show it; and the heading, by `measured` ones or derived."""
+) -> tuple[Signal | None, Signal, Course]:
+    """Velocity, None where the fixes have to show it; the samples that it is of; and the heading, by `measured` ones or
+    derived."""
     summary, speed = steps.summary, way.speed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), only(rows, "speed")
     heading = _heading(measured, world, shown, derived, way.yaw_rate, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
-        return Signal(world.t, np.nan_to_num(world.value)), heading._replace(wanders=0.0)
+        return Signal(world.t, np.nan_to_num(world.value)), world, heading._replace(wanders=0.0)
     if len(speed.t) and (heading.at is not unknown or abs(speed.value.mean()) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
-        angle = heading.at(speed.t)
-        kept = np.isfinite(angle) | (np.abs(speed.value[:, 0]) < STANDS) | (heading.at is unknown)
-        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~kept])])
-        velocity = speed.value * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(speed.t[kept], velocity[kept]), heading
+        at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
+        pace = np.interp(at, speed.t, speed.value[:, 0])
+        angle = heading.at(at)
+        kept, own = np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading.at is unknown), np.isin(at, speed.t)
+        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
+        velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
+        return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading
     if len(speed.t):
         raise InputError(
             f"{place(speeds)}, speed",
@@ -303,7 +308,7 @@ def _in_world(
             "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z.",
         )
     summary.assume(DERIVED, name)
-    return None, heading._replace(wanders=shown.wanders)
+    return None, way.fixes, heading._replace(wanders=shown.wanders)
 
 
 def _heading(
