@@ -62,7 +62,7 @@ def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(fault, ev
 
 
 def test_a_neighbour_whose_wheels_spin_costs_the_joint_filter_little():
-    """Where healthy egos erred by 1.18 m, not 0.58: what is sent tells of its odometry as it does of one's own."""
+    """Healthy egos erred by 1.18 m, not 0.58: their filters now know the variance of a corrected neighbour, too."""
     seen, truth = drive(10, 1.5, most=3)
     velocity = seen.velocity.copy()
     others = np.setdiff1d(np.arange(len(seen.ids)), EGOS)[::2]

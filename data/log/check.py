@@ -10,6 +10,7 @@ import scipy  # its statistics take half a second, and are imported where they a
 
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import dimensions
+from coopoc.methods.doubts import when
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.odometry_fault import with_odometry
 
@@ -113,8 +114,10 @@ def check(log: Log) -> Check:
 
 def _failing(c: Check) -> dict[str, str]:
     """Vehicles whose odometry fixes correct, and when."""
-    noise = with_odometry(c.world, range(len(c.world.ids)), NoiseModel.nominal(c.world.sensors))[1]
-    return dict(note.removeprefix("odometry, ").split(": ", 1) for note in noise.notes if note.startswith("odometry, "))
+    rec = c.world
+    extra = with_odometry(rec, range(len(rec.ids)), NoiseModel.nominal(rec.sensors))[1].extra
+    failed = np.zeros((0, 0)) if extra is None else (extra[0] > 0).T
+    return {name: when(rec.t, each) for name, each in zip(rec.ids, failed, strict=False) if each.any()}
 
 
 def _without(c: Check, columns: Sequence[int]) -> Check:
@@ -285,7 +288,7 @@ def _of_vehicles(c: Check) -> list[str]:
             cause = "slips, or a speed or heading that is held or wrong."
             if back.sum() >= 3:
                 cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
-            sentences.append(f"{name}: its odometry {c.failing[name]}: {cause}")
+            sentences.append(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
         elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
             sentences.append(
                 f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "

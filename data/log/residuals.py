@@ -42,7 +42,7 @@ class Check:
             each clock, and of what follows.
         ranges: share by which they are too long, s by which they are late, 0 where not sure; each with its standard
             error.
-        failing: vehicles whose odometry fixes correct -> what is said of it.
+        failing: vehicles whose odometry fixes correct -> when, in words.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
