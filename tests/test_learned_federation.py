@@ -77,10 +77,13 @@ def trained(group: Sequence[Client], rounds: int = 3, model: Gain | None = None,
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"aggregate": "median", "participation": Participation(0.5)}], ids=["mean", "median"]
+    "options",
+    [{}, {"aggregate": "median", "participation": Participation(0.5)}, {"schedule": Schedule(batch=10**6)}],
+    ids=["mean", "median", "all"],
 )
 def test_the_order_of_the_clients_changes_nothing(four, options):
-    """Same seed, same weights, bit for bit, whatever the order of the clients."""
+    """Same seed, same weights, bit for bit, whatever the order of the clients, also of those with few pieces."""
+    four = (replace(four[0], training=four[0].training.take([0, 1])), *four[1:])
     one, other = trained(four, seed=3, **options), trained(four[::-1], seed=3, **options)
     for a, b in zip(one.history, other.history, strict=True):
         assert torch.equal(a.weights, b.weights)

@@ -134,6 +134,8 @@ def test_a_pass_sees_every_piece_and_a_step_one_batch():
     assert np.bincount(plan.ravel()).tolist() == [3] * 10
     assert Schedule(epochs=7, batch=4).plan(10, draw).shape == (7, 4)
     assert all(len(set(row)) == 4 for row in Schedule(epochs=50, batch=4).plan(10, draw).tolist())
+    for epoch in ("step", "pass"):
+        assert Schedule(epochs=3, epoch=epoch, batch=10**6).plan(10, draw).shape == (3, 10)
 
 
 def test_a_net_that_breaks_stops_with_a_reason():

@@ -145,7 +145,9 @@ def test_a_noun_keeps_no_array_that_its_owner_can_change():
     whole[3] = 99.0
     assert fleet.t[3] == 0.3
     assert not RECORDING.links.of(0).flags.writeable
-    for noun in (FLEET, RECORDING, TRACK, of_track(TRACK, RECORDING, co.Kalman().message)):
+    graph = replace(PAIR, x0=np.eye(2, 3)).constrain("range", ("a", "b"), lower=1.0)
+    graphs = (graph, *graph.factors, *graph.constraints)
+    for noun in (FLEET, RECORDING, TRACK, of_track(TRACK, RECORDING, co.Kalman().message), *graphs):
         for copied in (copy.deepcopy(noun), pickle.loads(pickle.dumps(noun))):
             for part in (copied, getattr(copied, "links", copied)):
                 assert not any(a.flags.writeable for a in vars(part).values() if isinstance(a, np.ndarray) and a.size)

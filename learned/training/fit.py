@@ -132,9 +132,10 @@ def descend(
     weights = theta.numpy()
     moments = Moments(weights, np.zeros_like(weights), np.zeros_like(weights))
     for step in range(max(map(len, plans))):
-        rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
+        going = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
         losses = np.full(len(plans), math.nan, np.float32)
-        if rows:
+        for size in {plans[row].shape[1] for row in going}:
+            rows = [row for row in going if plans[row].shape[1] == size]
             dice = [draws[r] for r in rows]
             batch = pool.batch(torch.from_numpy(np.array([plans[r][step] for r in rows])))
             batch = mirrored(batch, dice) if schedule.mirror else batch

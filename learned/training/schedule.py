@@ -28,7 +28,7 @@ class Schedule:
     epoch: Epoch = "step"
     """"step": one optimiser step on one random batch, as KalmanNet's published loop counts. "pass": all the data."""
     batch: int = 2
-    """Segments per step. The paper's 1 is as accurate and takes half as long again (docs/learned.md)."""
+    """Segments per step, at most all. The paper's 1 is as accurate and takes half as long again (docs/learned.md)."""
     learning_rate: float = 1e-3
     """Of AdamW, falling to zero as a half cosine. The paper's 0.3 does not train (docs/learned.md)."""
     weight_decay: float = 0.3
@@ -46,12 +46,13 @@ class Schedule:
 
     def plan(self, pieces: int, draw: np.random.Generator) -> Ints:
         """(steps, batch) indices of the pieces that each optimiser step sees, without repetition within a pass."""
-        steps = self.epochs if self.epoch == "step" else -(-self.epochs * pieces // self.batch)
-        if self.epoch == "step" and self.batch <= pieces:
-            return np.stack([draw.permutation(pieces)[: self.batch] for _ in range(steps)])
-        passes = -(-steps * self.batch // pieces)
+        batch = min(self.batch, pieces)
+        if self.epoch == "step":
+            return np.stack([draw.permutation(pieces)[:batch] for _ in range(self.epochs)])
+        steps = -(-self.epochs * pieces // batch)
+        passes = -(-steps * batch // pieces)
         order = np.concatenate([draw.permutation(pieces) for _ in range(passes)])
-        return order[: steps * self.batch].reshape(steps, self.batch)
+        return order[: steps * batch].reshape(steps, batch)
 
 
 def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:

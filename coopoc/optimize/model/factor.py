@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of
+from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of, remade
 from ...errors import InputError
 from .inputs import (
     check_constants,
@@ -111,6 +111,8 @@ class Factor:
     loss: Loss | None = None
     twice: bool = False
     cov: InitVar[npt.ArrayLike | None] = None
+
+    __reduce__ = remade
 
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
         measurement = _checked(self)
@@ -272,6 +274,8 @@ class Constraint:
     lower: Floats
     upper: Floats
     constants: Floats | None = None
+
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         measurement = _checked(self)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, checked, frozen, listed
+from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise, sparse_jacobian
-from .factor import Constraint, Factor, names_of, taken, unchecked
+from .factor import Constraint, Factor, taken, unchecked
 from .inputs import check_rotations
 from .measurements import lookup
 from .space import Space
@@ -96,6 +96,8 @@ class Problem:
     fixed: tuple[int, ...] = ()
     constraints: tuple[Constraint, ...] = ()
     search: Search = Search()
+
+    __reduce__ = remade
 
     def __post_init__(self) -> None:
         for field in ("names", "factors", "separator", "poses", "fixed", "constraints"):
@@ -237,9 +239,6 @@ class Problem:
     def rows_among(self, used: Bools) -> list[Ints]:
         """Of each factor, the rows whose nodes are all used (n,)."""
         return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in self.factors]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in names_of(Problem)}
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (n, ambient)."""
