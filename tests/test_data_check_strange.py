@@ -92,6 +92,12 @@ def test_nothing_is_named_in_clean_logs(tmp_path, kind, hidden):
     assert not named
 
 
+def test_ranges_of_a_convoy_look_like_no_scale_where_a_clock_differs(tmp_path):
+    folder = strange(tmp_path / "log", "car", 1, clocks={"car1": 0.3})
+    (folder / "truth.csv").unlink()
+    assert re.fullmatch(r"car1: its clock is 0\.(2[5-9]|3)\S* \+- 0\.0[12]\S+ s ahead of .*", said(folder))
+
+
 OTHER = {"drone1": "drone2", "drone2": "drone1"}
 OF_RANGES: dict[str, Any] = {
     r"drone0 to drone1 by \S+ m, as if to drone2": lambda f: {

@@ -113,6 +113,16 @@ def test_each_fix_counts_as_it_is_stated(tmp_path):
         assert off[poor].mean() < 0.7
 
 
+def test_a_vehicle_without_odometry_adds_no_noise_to_that_of_others(tmp_path):
+    speed, course = car()
+    alone = log(tmp_path, "car", 1.5, 10, vx=speed * np.cos(course), vy=speed * np.sin(course), vz=0 * T)[0]
+    pd.read_csv(tmp_path / "a.csv", usecols=["t", *"xyz"]).dropna().to_csv(tmp_path / "b.csv", index=False)
+    both = co.read_log(tmp_path)
+    for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter(), co.BatchSmoother()):
+        assert_allclose(method(both.recording, ["a"]).x, method(alone.recording, ["a"]).x, atol=1e-6)
+    assert not any(text.startswith("b") for text in check(both).warnings)
+
+
 @pytest.mark.parametrize(("std", "bias"), [(1.5, 0.0), (1.5, 0.01), (15.0, 0.003)])
 def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, std, bias):
     """Beside the same log with a compass of 1 degree; without a gyro beside fixes alone."""

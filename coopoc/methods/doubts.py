@@ -72,6 +72,7 @@ def doubts(
     if recording.body is None:
         drive = recording.gnss, recording.velocity, egos, doubtful
         mark_odometers(*drive, fixes, motion, every, recording.dt, marks)
+        marks[2, recording.motion_extra[:, egos, 0].any(axis=0)] = 0  # without odometry
 
     def add(text: str, marked: Ints, *names: int) -> None:
         if marked.any():

@@ -139,10 +139,18 @@ class NoiseModel:
             inbox: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
             first: step at which the filter begins.
         """
-        if self.extra is not None:
-            # of neighbours, too: what they send of fixes and velocities shows the same to who receives it
-            more = self.extra if columns is None or inbox is not None else self.extra[:, :, columns]
-            return replace(self, extra=None).process_variance(recording, columns, inbox, first) + more[..., None]
+        variance = self._of_speed(recording, columns, inbox, first)
+        stated = self.process_std is None and recording.motion_variance.size > 0
+        for more in (self.extra, recording.motion_extra[None, ..., 0] if stated else None):
+            if more is not None:
+                # of neighbours, too: what they send of fixes and velocities shows the same to who receives it
+                variance = variance + (more if columns is None or inbox is not None else more[:, :, columns])[..., None]
+        return variance
+
+    def _of_speed(
+        self, recording: Recording, columns: Sequence[int] | Ints | None, inbox: Inbox | None, first: int
+    ) -> Floats:
+        """`process_variance` but what is more at some steps."""
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None

@@ -15,7 +15,7 @@ def with_odometry(
     recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0
 ) -> tuple[Recording, NoiseModel]:
     """The recording with velocities that fixes correct, of vehicles whose odometry fails, and the noise of these, with
-    a note; both as they are where none fails, no noise is stated, or velocities are those of fixes.
+    a note; both as they are where none fails, no noise is stated, or velocities are uncertain as those of fixes are.
 
     Args:
         recording: in the world frame.
@@ -27,7 +27,7 @@ def with_odometry(
     if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
         return recording, noise_model
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    columns = columns[~np.isin(columns, recording.landmarks)]
+    columns = columns[~np.isin(columns, recording.landmarks) & ~recording.motion_extra[:, columns, 0].any(axis=0)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh = new_state(motion_noise(noise_model, recording.dt))
     variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)

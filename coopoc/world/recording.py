@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, remade, texts
+from ..arrays import TINY, Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
 from .fleet import clock, columns, interval, names
@@ -90,6 +90,8 @@ class Recording:
         landmarks: columns of members that stand at their `gnss`, which is known exactly; they need no message, and
             links to them count in no budget.
         fix_factor: (T, N) by which the deviation of each fix is larger than `sensors` says; none: all are 1.
+        motion_variance: (T, N) m^2/s by which each motion is less certain than `sensors` says, as of a vehicle without
+            odometry beside others; none: all are 0.
 
     Raises:
         InputError: arrays of other shapes or kinds, links of steps or columns that are not there, more of them than
@@ -111,6 +113,7 @@ class Recording:
     body: Body | None = None
     landmarks: tuple[int, ...] = ()
     fix_factor: Floats = field(default_factory=lambda: np.empty(0))
+    motion_variance: Floats = field(default_factory=lambda: np.empty(0))
 
     __reduce__ = remade
 
@@ -136,11 +139,12 @@ class Recording:
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
         if self.body is not None:
             instance("body", self.body, Body).check(self.velocity)
-        shape = gnss.shape[1:3] if plain(self.fix_factor).size else (0,)
-        factor = checked("fix_factor", self.fix_factor, "(T, N) or (0,)", shape)
-        wrong, allowed = ~((factor > 0) & (factor < np.inf)), "must be > 0 and finite"
-        refuse("fix_factor", factor, wrong, allowed, "1 is as `sensors` says.")
-        self.__dict__["fix_factor"] = factor
+        for name, least, stated in (("fix_factor", TINY, 1), ("motion_variance", 0.0, 0)):
+            shape = gnss.shape[1:3] if plain(getattr(self, name)).size else (0,)
+            values = checked(name, getattr(self, name), "(T, N) or (0,)", shape)
+            wrong, allowed = ~((values >= least) & (values < np.inf)), f"must be {'>' * stated or '>='} 0 and finite"
+            refuse(name, values, wrong, allowed, f"{stated} is as `sensors` says.")
+            self.__dict__[name] = values
         self.sensors.check_assumed()
         self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))
 
@@ -153,6 +157,12 @@ class Recording:
     def fix_scale(self) -> Floats:
         """(T, N, 1) `fix_factor`, or ones."""
         return np.broadcast_to(self.fix_factor if self.fix_factor.size else 1.0, self.gnss.shape[1:3])[..., None]
+
+    @property
+    def motion_extra(self) -> Floats:
+        """(T, N, 1) m^2 a step, of `motion_variance`, or zeros."""
+        more = self.dt * self.motion_variance if self.motion_variance.size else 0.0
+        return np.broadcast_to(more, self.gnss.shape[1:3])[..., None]
 
     @property
     def measured(self) -> bool:
@@ -209,6 +219,7 @@ class Recording:
             arrival=np.where((arrival >= 0) & (arrival < stop), arrival - start, -1),
             body=body and Body(body.yaw_rate[:, start:stop], body.heading[:, start:stop]),
             fix_factor=self.fix_factor[start:stop],
+            motion_variance=self.motion_variance[start:stop],
         )
 
     def stretches(self, vehicle: int | str, shortest: int = 2, fixed: bool = True) -> tuple[tuple[int, int], ...]:

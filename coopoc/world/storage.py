@@ -21,7 +21,10 @@ from .recording import Body, Recording
 from .sensors import Sensors
 from .v2x import V2X
 
-ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks", "fix_factor")
+ARRAYS = (
+    *("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks"),
+    *("fix_factor", "motion_variance"),
+)
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
 WORDS = "coopoc_recording"

@@ -406,8 +406,7 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND):
             continue
-        derived = truth is None and rec.sensors.velocity_reading == "fixes"
-        derived |= truth is None and _off(row)  # what draws positions aside draws them along a bend, too
+        derived = truth is None and (c.shown(column) or _off(row))  # what draws aside draws along a bend, too
         if sure[2] and abs(lag := factor[2]) >= LEAST_LAG and not derived:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(

@@ -177,7 +177,7 @@ def odometry(c: Check, column: int) -> Estimate:
     """
     rec, truth, body = c.world, c.log.truth, c.log.recording.body
     none = Estimate(np.zeros(5), np.full(5, np.inf))
-    if rec.sensors.velocity_reading == "fixes":
+    if c.shown(column):
         return none
     velocity = rec.velocity[0, :, column, :2]
     noise = np.nan_to_num(rec.sensors.velocity_std(velocity, rec.sensors.velocity_floor))
@@ -253,10 +253,10 @@ def _polar(turned: complex) -> Floats:
     return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
 
 
-def clocks(c: Check, reference: int | None) -> tuple[Estimate, AnyArray]:
-    """By what each vehicle's clock is ahead of that of a reference, or of one that most agree with, s; by what
-    share ranges are too long; and by what they are late, s: (N + 2,), and what a range or direction misses for 1 of
-    each (L, 2, N + 2).
+def clocks(c: Check, reference: int | None, alike: bool) -> tuple[Estimate, AnyArray]:
+    """By what each vehicle's clock is ahead of that of a reference, or of one that most agree with, s; if `alike`, by
+    what share all ranges are too long, and by what they are late, s: (N + 2,), and what a range or direction misses for
+    1 of each (L, 2, N + 2).
 
     Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
     unit vector from i to j; where ranges are d s late, u (v_i - v_j) d.
@@ -275,7 +275,8 @@ def clocks(c: Check, reference: int | None) -> tuple[Estimate, AnyArray]:
         return np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
 
     velocity = np.nan_to_num(c.world.velocity[0])
-    made, then = made_by(velocity), made_by(following(c, velocity))
+    causes = np.arange(size + 2) < size + 2 * alike
+    made, then = (causes * made_by(each) for each in (velocity, following(c, velocity)))
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
@@ -350,7 +351,7 @@ def lag_of_fixes(c: Check, column: int) -> float:
     """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move from one to
     that LEAST_COUNT later, else 0; of a way that repeats the least."""
     rec, truth = c.world, c.log.truth
-    if truth is None and rec.sensors.velocity_reading == "fixes":  # it comes of the fixes, whenever they are
+    if truth is None and c.shown(column):
         return 0.0
     velocity, fixes = plane(rec.velocity[0, :, column]), plane(rec.gnss[0, :, column])
     path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
@@ -404,11 +405,12 @@ def on_time(c: Check, alike: bool = True) -> Check:
         seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
         covered = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
         reference = int(np.argmin(np.where(covered, np.abs(seconds), np.inf))) if covered.any() else None
-    estimate, made = clocks(c, reference)
-    size, error = len(c.world.ids), estimate.error
+    (value, error), made = clocks(c, reference, alike)
+    size, maybe = len(c.world.ids), np.abs(value) > 2.0 * error
+    if alike and not (maybe[size:].any() and abs(value[size]) < UNITS_APART):  # clocks look like it, or undo it
+        return on_time(c, False)
     least = np.where(np.arange(size + 2) == size, LEAST_SCALE, LEAST_LAG)
-    off = np.where(np.abs(estimate.value) > np.maximum(SURE_ERRORS * error, least), estimate.value, 0.0)
-    off[size:] *= alike & (abs(off[size]) < UNITS_APART)
+    off = np.where(np.abs(value) > np.maximum(SURE_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ off)
     slack = np.nan_to_num(made * np.where(off, error, 0.0))

@@ -1,6 +1,6 @@
 """Clock offsets, SI units and the local east-north-up frame of a log's rows; the sensor noise that they state."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -156,7 +156,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         body: whether the recording is in body frames.
         summary: takes what is assumed.
         dt: s, of the recording.
-        members: of the log; where fixes have shown a velocity, the one that wanders most gives the noise of all.
+        members: of the log; where fixes have shown all velocities, the one that wanders least gives the noise of all.
     """
     base, used = Sensors(), set(rows["kind"])
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
@@ -184,8 +184,8 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         rate = rare * of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
-    wandering = [(member.heading.unsure, member.climbs, member.heading.wanders) for member in members]
-    derived, climbs, drifts = np.max(wandering, axis=0).tolist()
+    derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], axis=0).tolist()
+    drifts = least_wander(members)
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
     elif derived and "bearing" in used:
@@ -200,7 +200,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         summary.assume(
             f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )
-        if any(member.shown for member in members):
+        if len(summary.shown) == sum(not member.stands for member in members):
             noise["velocity_reading"] = "fixes"
     elif {*MOTION}.isdisjoint(square.index):
         ratio, floor = base.velocity_std_ratio, base.velocity_floor
@@ -213,6 +213,12 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
                 f"{floor:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds"
             )
     return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
+
+
+def least_wander(members: "Iterable[Member]") -> float:
+    """m^2/s, by which the position of the vehicle that wanders least does, as fixes have shown its velocity; 0 where
+    one has odometry."""
+    return min((member.heading.wanders for member in members if not member.stands), default=0.0)
 
 
 def fix_factors(rows: Rows, ids: Sequence[str], steps: "Steps") -> Floats:

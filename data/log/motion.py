@@ -109,7 +109,6 @@ class Member:
         yaw_rate: (T,) rad/s as velocity, of body frames.
         compass: (T,) rad, NaN without a heading, of body frames.
         moves: (T, 3) m/s, as velocity, in the world; in body frames NaN where no heading is known.
-        shown: whether fixes alone have shown its velocity, or its direction without a gyro.
         climbs: m^2/s, as `climbing`, of heights whose velocity was not measured.
     """
 
@@ -121,7 +120,6 @@ class Member:
     yaw_rate: Floats
     compass: Floats
     moves: Floats
-    shown: bool = False
     climbs: float = 0.0
 
 
@@ -242,11 +240,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    alone = heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2)
+    if heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2):
+        summary.shown.append(name)
     velocity = velocity + absent[:, None]
     climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
-    return Member(gnss, velocity, heading, text, False, rate, compass, moves, alone, climbs)
+    return Member(gnss, velocity, heading, text, False, rate, compass, moves, climbs)
 
 
 def climbing(fixes: Signal) -> float:

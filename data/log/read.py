@@ -35,7 +35,7 @@ from ..librsf import is_librsf, read_librsf
 from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
+from .frames import ENU, Origin, assumed, fix_factors, least_wander, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
@@ -269,6 +269,8 @@ def _recording(
     names = ("gnss", "velocity", "yaw_rate", "compass")
     gnss, velocity, yaw_rate, compass = (stacked(members, name)[None] for name in names)
     factor = np.empty(0) if body or sensors else fix_factors(rows, ids, steps)
+    wander = np.array([member.heading.wanders for member in members.values()]) - least_wander(members.values())
+    uncertain = np.tile(wander.clip(0.0), (len(steps.grid), 1)) if wander.max() > 0.0 and not sensors else np.empty(0)
     sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
     return Recording(
         ids=ids,
@@ -286,6 +288,7 @@ def _recording(
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
         fix_factor=factor,
+        motion_variance=uncertain,
     )
 
 

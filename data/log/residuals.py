@@ -69,6 +69,11 @@ class Check:
     warnings: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
 
+    def shown(self, column: int) -> bool:
+        """Whether a velocity is of the fixes, whenever they are."""
+        reading = self.world.sensors.velocity_reading
+        return reading == "fixes" or self.world.ids[column] in self.log.summary.shown
+
     @property
     def fix_noise(self) -> float:
         """m, of a fix in the plane."""

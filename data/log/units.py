@@ -225,6 +225,7 @@ class Summary:
         unused: what was never meant to be read -> number of cells.
         odometry: s, from one sample of it to the next, 0 where there is none.
         rows: how many numbers were logged.
+        shown: vehicles of which fixes alone have shown the velocity, or its direction without a gyro.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
 
     >>> summary = Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3})
@@ -247,6 +248,7 @@ class Summary:
     unused: dict[str, int] = field(default_factory=dict)
     odometry: float = 0.0
     rows: int = 0
+    shown: list[str] = field(default_factory=list)
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
     def count(self, what: str, number: int) -> None:

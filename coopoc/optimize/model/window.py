@@ -114,6 +114,7 @@ def window(
     if noise is None:
         fix_std = np.array(recording.sensors.gnss_std) * recording.fix_scale
         motion_std = recording.sensors.motion_std(recording.velocity[[run]], recording.dt)[0]
+        motion_std = np.sqrt(motion_std**2 + recording.motion_extra)
     else:
         sensors, fix_std = noise.sensors, np.sqrt(noise.fix_variance(recording)[0])
         motion_std = np.sqrt(np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)[run])
