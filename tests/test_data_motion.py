@@ -139,6 +139,19 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
         assert error(course_of_fixes, method) < 1.3 * alone
 
 
+@pytest.mark.parametrize("method", [co.Kalman(), co.CooperativeFilter()])
+def test_a_course_that_is_held_without_fixes_is_lost_on_bends(tmp_path, method):
+    """Behind a tunnel of half a minute, without a gyro."""
+    read = log(tmp_path, "car", 1.5, 10, steps=[k for k in range(0, len(T), 10) if not 600 < k < 900], speed=car()[0])[
+        0
+    ]
+    track = method(read.recording)
+    behind = np.flatnonzero(read.recording.t > 92)
+    off = np.linalg.norm(track.x[0, behind, 0] - read.truth.position[behind, 0], axis=1)
+    assert np.sqrt(np.mean(off**2)) < 3.0
+    assert np.nanmean(co.nees(track, read.truth)) < 4.0
+
+
 def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path):
     speed, course = car()
     read = log(tmp_path / "log", "car", 1.5, 10, speed=speed, yaw_rate=-np.gradient(course, 0.1))[0]
@@ -159,7 +172,7 @@ def test_nothing_looks_ahead(tmp_path, given):
     (tmp_path / "moved").mkdir()
     rows.to_csv(tmp_path / "moved" / "a.csv", index=False)
     moved = co.read_log(tmp_path / "moved").recording
-    moved = replace(moved, sensors=read.recording.sensors)
+    moved = replace(moved, sensors=read.recording.sensors, motion_variance=read.recording.motion_variance)
     before = read.recording.t < 119.99
     for method in (co.Kalman(), co.CooperativeFilter()):
         one, other = method(read.recording).x[:, before], method(moved).x[:, before]

@@ -251,7 +251,8 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     std = noise.motion_std(recording.velocity[:, :, egos], recording.dt)[:, 1:]
     moving = np.nan_to_num(std)[..., None] * axes
     covariance = track.covariance[:, :-1] + np.einsum("...ki,...kj->...ij", moving, moving)
-    covariance[..., range(3), range(3)] += np.square(noise.fix_std * recording.fix_scale[1:, egos])
+    fixes = np.square(noise.fix_std * recording.fix_scale[1:, egos])
+    covariance[..., range(3), range(3)] += fixes + recording.motion_extra[1:, egos]
     if track.heading_covariance is not None:
         shared, variance = track.heading_covariance[:, :-1, :, :3], track.heading_covariance[:, :-1, :, 3, None, None]
         aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])

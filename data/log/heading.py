@@ -48,12 +48,16 @@ class Course(NamedTuple):
         source: what it is the course of, "" where it was measured.
         wanders: m^2/s, by which a position that is predicted with it becomes uncertain.
         unsure: rad, standard deviation of a heading that was derived.
+        shown: (M,) s, when fixes have shown it, where nothing else turns it until they do again.
+        bends: rad/m, root mean square of how it turns on the way.
     """
 
     at: HeadingAt = unknown
     source: str = ""
     wanders: float = 0.0
     unsure: float = 0.0
+    shown: Floats = np.empty(0)
+    bends: float = 0.0
 
 
 class Reckoning(NamedTuple):

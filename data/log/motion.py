@@ -109,6 +109,7 @@ class Member:
         yaw_rate: (T,) rad/s as velocity, of body frames.
         compass: (T,) rad, NaN without a heading, of body frames.
         moves: (T, 3) m/s, as velocity, in the world; in body frames NaN where no heading is known.
+        wander: (T,) m^2/s, by which its position becomes uncertain, as fixes have shown its velocity or direction.
         climbs: m^2/s, as `climbing`, of heights whose velocity was not measured.
     """
 
@@ -120,6 +121,7 @@ class Member:
     yaw_rate: Floats
     compass: Floats
     moves: Floats
+    wander: Floats
     climbs: float = 0.0
 
 
@@ -175,7 +177,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = Course(unknown if body else heading_at(measured, None, np.inf))
-        return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still)
+        return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still, still[:, 0])
     std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
     shown, (derived, mirrored) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
@@ -240,12 +242,13 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    if heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2):
-        summary.shown.append(name)
+    alone = heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2)
+    summary.shown += [name] * alone
+    wander = _wander(heading if alone and not by_fixes else Course(wanders=heading.wanders), moves, steps)
     velocity = velocity + absent[:, None]
     climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
-    return Member(gnss, velocity, heading, text, False, rate, compass, moves, climbs)
+    return Member(gnss, velocity, heading, text, False, rate, compass, moves, wander, climbs)
 
 
 def climbing(fixes: Signal) -> float:
@@ -327,9 +330,24 @@ def _heading(
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
         if (moving := (pace > np.maximum(MOVING, SHOWN_STDS * unsure)) & certain).any():
-            courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
-            return Course(courses, source, wanders, float(np.median(unsure[moving] / pace[moving])))
+            t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
+            bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
+            courses, std = heading_of_courses(Signal(t, velocity.value[moving]), rate), unsure[moving] / pace[moving]
+            return Course(courses, source, wanders, float(np.median(std)), t[: len(t) * (rate is None)], float(bends))
     return Course()
+
+
+def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:
+    """(T,) m^2/s, by which a position becomes uncertain: `heading.wanders`, and where a course is held for longer than
+    fixes are apart, by d/dt of (k s^2 / 2)^2, with the bends k of the way s since then, of s^2 at most."""
+    more: Floats = np.zeros(len(moves))
+    if len(heading.shown) > 1:
+        pace = np.linalg.norm(np.nan_to_num(moves), axis=1)
+        way = np.cumsum(pace) * steps.dt
+        last = heading.shown[np.searchsorted(heading.shown, steps.grid).clip(1) - 1] + steps.gap(heading.shown)
+        s = (way - np.interp(last, steps.grid, way)).clip(0.0)
+        more = np.minimum(heading.bends**2 * s**3, 2.0 * s) * pace
+    return heading.wanders + more
 
 
 def _longest(there: Bools, grid: Floats) -> str:

@@ -269,8 +269,8 @@ def _recording(
     names = ("gnss", "velocity", "yaw_rate", "compass")
     gnss, velocity, yaw_rate, compass = (stacked(members, name)[None] for name in names)
     factor = np.empty(0) if body or sensors else fix_factors(rows, ids, steps)
-    wander = np.array([member.heading.wanders for member in members.values()]) - least_wander(members.values())
-    uncertain = np.tile(wander.clip(0.0), (len(steps.grid), 1)) if wander.max() > 0.0 and not sensors else np.empty(0)
+    wander = stacked(members, "wander") - least_wander(members.values())
+    uncertain = wander.clip(0.0) if wander.max() > 0.0 and not sensors else np.empty(0)
     sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
     return Recording(
         ids=ids,
