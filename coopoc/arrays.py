@@ -113,13 +113,13 @@ def plain(values: object) -> AnyArray:
 
 
 def listed(field: str, values: Any, hint: str, allowed: str = "must be a sequence") -> list[Any]:
-    """Entries of a sequence; InputError for one text, for what has no entries, or has them once only (a generator).
+    """Entries of a sequence; InputError for one text, for what has no entries, no order, or has them once only.
 
     >>> listed("egos", np.array(3), "Give [3].")
     Traceback (most recent call last):
     coopoc.errors.InputError: egos = array(3): must be a sequence. Give [3].
     """
-    if not isinstance(values, str | bytes) and not np.ma.is_masked(values):
+    if not isinstance(values, str | bytes | set | frozenset) and not np.ma.is_masked(values):
         try:
             if (entries := iter(values)) is not values:
                 return list(entries)
@@ -161,7 +161,7 @@ def number(
         raise InputError(field, shown(value), f"must be a {word}, {allowed}", hint)
     result = kind(scalar.item())
     if not low <= result <= high:
-        most = f" and at most {high:g}" if allowed.startswith(">") and result > high else ""
+        most = f" and at most {high:g}" if ">" in allowed and high < result < np.inf else ""
         raise InputError(field, value, f"must be {allowed}{most}", hint)
     return result
 

@@ -65,7 +65,7 @@ MISTAKES = (
     ("run small --set rums=3", "Did you mean runs?"),
     ("run small --jobs 0", "jobs = 0: must be >= 1"),
     ("reference nowhere", "folder = nowhere: holds no manifest.json"),
-    ("table nowhere", "folder = nowhere: holds no views yet"),
+    ("table nowhere", "folder = nowhere: holds no views.json"),
     ("report", "folders = none"),
 )
 OF_OTHERS = ("greet --name x", "kin greet", "kin --help", "kin gret")

@@ -130,6 +130,8 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         (lambda: of_track(TRACK, RECORDING.of_runs([0, 0]), co.Kalman().message), "track = 1 runs: must have 2"),
         (lambda: fix_innovations(TRACK, OTHER), "ids and times differ from those that were recorded"),
         (lambda: co.Kalman()(RECORDING, iter([0])), "egos = .*must be a sequence"),
+        (lambda: co.Kalman()(RECORDING, {*RECORDING.ids}), "egos = .*must be a sequence"),
+        (lambda: co.Kalman("identity").start().step(np.zeros(3), np.zeros(3), 1e9), r"> 0 and at most 1e\+08"),
     ],
 )
 def test_what_cannot_be_computed_says_why(call, words):

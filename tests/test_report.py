@@ -109,5 +109,5 @@ def test_folders_that_cannot_be_shown_are_named(made, tmp_path):
         report([folder, folder], tmp_path / "r.html")
     with refused(r"is a folder\. Name the file"):
         report([folder], tmp_path)
-    with refused(r"holds no manifest\.json"):
-        report([tmp_path], tmp_path / "r.html")
+    with refused(rf"holds no manifest\.json\. Give {folder}"):
+        report([folder.parent], tmp_path / "r.html")

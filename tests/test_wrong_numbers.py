@@ -329,8 +329,9 @@ def test_plausible_limits_hold_where_a_noun_is_made():
     for field, value in (("gnss", 1e9), ("velocity", 1e5), ("relative", 1e18)):
         with refused(rf"{field}\[0, 0, 0.*: must be within"):
             replace(SEEN, **{field: np.full(getattr(SEEN, field).shape, value)})
-    with refused("must be printable"):
-        replace(FLEET, ids=("a", "b\r=1+1"))
+    for name in ("b\r=1+1", "", " "):
+        with refused("must be printable"):
+            replace(FLEET, ids=("a", name))
 
 
 def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:

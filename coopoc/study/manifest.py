@@ -57,7 +57,7 @@ def read(folder: Path) -> Manifest:
         InputError: none, a damaged one, or one whose names are no file names: they would lead out of the folder.
     """
     path = folder / NAME
-    fields = store.content(path, _FIELDS, f"holds no {NAME}", "Give a folder that coopoc run has made.")
+    fields = store.content(path, _FIELDS)
     manifest = Manifest(**{name: fields[name] for name in _FIELDS})
     texts, cells = (*manifest.axes, *manifest.environment.values()), manifest.cells.values()
     if not (all(isinstance(text, str) for text in texts) and all(isinstance(params, dict) for params in cells)):

@@ -86,7 +86,7 @@ def views(folder: str | Path) -> Mapping[str, Any]:
         InputError: the study was not run to its end, the file is damaged, or a view's name is no file name.
     """
     path = given_path(folder) / VIEWS
-    stored = store.content(path, _FIELDS, "holds no views yet", "Run the study to its end: coopoc run NAME.")
+    stored = store.content(path, _FIELDS)
     for view in (*stored["tables"], *stored["figures"]):
         if not isinstance(view, dict) or not isinstance(view.get("caption"), str):
             raise store.damaged(path, "a view without a caption")

@@ -70,20 +70,20 @@ def _write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
         raise
 
 
-def content(path: Path, fields: Mapping[str, Any], absent: str, hint: str) -> dict[str, Any]:
+def content(path: Path, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a JSON file in the folder of a study.
 
     Args:
         path: of the file.
         fields: name -> type that the file must have.
-        absent: "allowed" of the error if there is no such file.
-        hint: of that error.
 
     Raises:
         InputError: no such file, no JSON, or a field that is missing or of another type.
     """
     if not path.is_file():
-        raise InputError("folder", str(path.parent), absent, hint)
+        below = sorted(path.parent.glob(f"*/{path.name}"))
+        hint = f"Give {below[0].parent}." if below else "Give a folder in which coopoc run has finished a study."
+        raise InputError("folder", str(path.parent), f"holds no {path.name}", hint)
     try:
         text = path.read_text("utf-8")
         document: Any = json.loads(text)

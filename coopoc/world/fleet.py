@@ -166,13 +166,13 @@ def names(ids: Iterable[object]) -> tuple[str, ...]:
     """
     hint = 'Give a tuple such as ("a", "b").'
     listed_ids = listed("ids", ids, hint)
-    if isinstance(ids, set) or not all(isinstance(i, str | int | np.integer) for i in listed_ids):
+    if not all(isinstance(i, str | int | np.integer) for i in listed_ids):
         raise InputError("ids", shown(ids), "must be a sequence of names or whole numbers", hint)
     texts = tuple(str(i) for i in listed_ids)
     if not texts:
         raise InputError("ids", "no vehicle", "must be at least one", "Check that the file holds a drive.")
     for name in texts:
-        if not name.isprintable():
+        if not name.strip() or not name.isprintable():
             raise InputError("ids", shown(name), "must be printable", "Remove line ends and control characters.")
     if len(set(texts)) != len(texts):
         twice = sorted(i for i, count in Counter(texts).items() if count > 1)
