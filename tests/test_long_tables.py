@@ -99,6 +99,7 @@ def test_a_path_that_no_program_could_read_is_refused(tmp_path):
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 2))), "position"),
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 3)), [0.0]), "heading"),
         (lambda: co.write_tum("", [0.0, 0.1], np.zeros((2, 3))), "path"),
+        (lambda: co.write_tum(tmp_path, [0.0, 0.1], np.zeros((2, 3))), "must be a file, and is a folder"),
     ):
         with pytest.raises(co.InputError, match=named):
             write()

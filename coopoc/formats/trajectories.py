@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, checked
 from ..errors import InputError
-from ..text import given_path
+from ..text import given_path, replaceable
 from .values import UNIT, read_table, to_orientation, to_rotation
 
 
@@ -99,4 +99,4 @@ def write_tum(
     _check_order(stamps, "pose {}".format)
     rotation = np.tile(np.eye(3), (len(where), 1, 1))
     rotation[:, :2, :2] = to_rotation(course[:, None])
-    np.savetxt(given_path(path), np.column_stack([stamps, where, to_orientation(rotation)]), fmt="%.9f")
+    np.savetxt(replaceable(given_path(path)), np.column_stack([stamps, where, to_orientation(rotation)]), fmt="%.9f")

@@ -131,7 +131,7 @@ class Reference:
         """Read what `save` wrote; InputError without such a file, or for a damaged one."""
         path, hint = given_path(path), "Write them with coopoc reference --write."
         fields = {"study": str, "settings": dict, "numbers": list}
-        document = store.content(path, fields, "holds no reference numbers", hint)
+        document = store.content(path, fields, hint)
         try:
             numbers = tuple(
                 Number(**{name: NUMBER_READERS[name](each[name]) for name in NUMBER_READERS})

@@ -70,19 +70,22 @@ def _write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
         raise
 
 
-def content(path: Path, fields: Mapping[str, Any]) -> dict[str, Any]:
+def content(
+    path: Path, fields: Mapping[str, Any], hint: str = "Give a folder in which coopoc run has finished a study."
+) -> dict[str, Any]:
     """Fields of a JSON file in the folder of a study.
 
     Args:
         path: of the file.
         fields: name -> type that the file must have.
+        hint: if there is no such file, and none in a folder below.
 
     Raises:
         InputError: no such file, no JSON, or a field that is missing or of another type.
     """
     if not path.is_file():
         below = sorted(path.parent.glob(f"*/{path.name}"))
-        hint = f"Give {below[0].parent}." if below else "Give a folder in which coopoc run has finished a study."
+        hint = f"Give {below[0].parent}." if below else hint
         raise InputError("folder", str(path.parent), f"holds no {path.name}", hint)
     try:
         text = path.read_text("utf-8")
