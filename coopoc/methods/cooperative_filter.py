@@ -48,7 +48,7 @@ class Priors(NamedTuple):
     Attributes:
         heading: rad, and
         scale: standard deviations of errors of odometry that last.
-        lasts: s, for which they do.
+        lasts: s, for which they do, over the square of the level of motions.
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
         range_scale: of such an error of the scale of these.
@@ -134,7 +134,7 @@ class CooperativeFilter(Checked):
     - *Trust*: the fixes of a vehicle that is new have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
       $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
       retrospect. A mean innovation that has become unlikely revokes the trust; in the
-      ego's own receiver, too, where there are neighbours.
+      ego's own receiver, too, where there are neighbours, unless these put it where its fix is: then it goes there.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
       exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$; that of a component far beyond
       it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`). A member that is
@@ -142,11 +142,12 @@ class CooperativeFilter(Checked):
       no vehicle can have reached are replaced by the last ones.
     - *Levels*: the variances of the ego's fixes, its neighbours' fixes, ranges, azimuths, inclinations and motions
       follow their innovations, between 0.14 and 33 times what is assumed, by recursive maximum likelihood
-      (`kernels.stars.otherwise`).
+      (`kernels.stars.otherwise`). Where odometry surely errs, what successive innovations share is motion's.
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
       $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges (of measured ones also their
-      scale, and an offset of each pair). Each is a state with a wide
-      prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
+      scale, and an offset of each pair); those of odometry change the faster, the noisier motions are. Each is a
+      state with a wide prior, and the estimate is the average over whether it is 0, by Bayes' rule
+      (`kernels.stars.otherwise`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
       is kept (`kernels.stars.otherwise`).
     - *The star*: an ego whose fixes and whose star contradict each other goes on alone for a while, where no noise

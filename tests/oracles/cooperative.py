@@ -581,15 +581,13 @@ class Oracle:
 
     def learn_fix(self, kind, rows: list[Any]):
         _, gap, cov, r = self.mahalanobis(self.state.belief, rows)
-        total = np.trace(cov) + r.sum()
-        square = gap @ gap
-        wild = kind == 3 and square > SUDDEN * total
-        s = self.state
-        displaced = wild and (s.agreed < ESTABLISHED or s.locked.get(self.ego, 0.0) < MAX_LOCKOUT)
-        more = min((np.square(gap - s.gap).sum() / 2 if displaced else square) / total, SUDDEN) - 1.0
-        self.learn(kind, more, r.sum() / total, 3)
-        if kind == 3 and not wild:
-            self.learn(5, more, self.state.made / total, 3)
+        total, s = np.trace(cov) + r.sum(), self.state
+        change, square = np.square(gap - s.gap).sum() / 2 / total, gap @ gap / total
+        wild, established = square > SUDDEN, s.agreed >= ESTABLISHED and s.locked.get(self.ego, 0.0) >= MAX_LOCKOUT
+        of_noise = kind == 3 and (self.life.absent[0] == -inf or (wild and not established))
+        self.learn(kind, min(change if of_noise else square, SUDDEN) - 1, r.sum() / total, 3)
+        if kind == 3 and not (wild and (s.jumped or change > SUDDEN)):
+            self.learn(5, min(square, SUDDEN) - 1, s.made / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
@@ -611,15 +609,19 @@ class Oracle:
             s.vague.discard(j)
             return 1.0
         judged = j != self.ego or any(i in s.last for i in s.members)
-        if g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows)):
-            if j in s.trusted:
+        doubtful = g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows))
+        if doubtful:
+            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= 0
+            if supported and j in s.trusted:
                 s.revoked[j] = s.revoked.get(j, 0) + 1
-            self.doubt(j)
+            elif not supported:
+                b.noise(("x", j), np.square(z - h @ b.x).sum() / 3)
+            self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
-            return 0.0
+            return 0.0 if supported else 1.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
@@ -633,7 +635,7 @@ class Oracle:
             if q > g.fix_gate and hits < PATIENCE:
                 share = g.fix_gate / q if q < HARD_REJECT_FACTOR * g.fix_gate else 0.0
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
-            if not judged and s.agreed >= ESTABLISHED:
+            if not judged and s.agreed >= ESTABLISHED and self.life.absent[0] > -inf:
                 locked[j] = min(locked[j], MAX_LOCKOUT)
         if share:
             b.updates(h, z, r, share=share)
@@ -664,13 +666,15 @@ class Oracle:
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
         return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
 
-    def doubt(self, j):
-        s = self.state
-        s.trusted.discard(j)
+    def doubt(self, j, tau=TAU):
+        """Its fixes have an error of that deviation, m, or none."""
+        s, variance = self.state, tau**2 + self.life.own
+        s.trusted = s.trusted - {j} if tau else s.trusted | {j}
         s.mean.pop(j, None)
         if ("x", j) in s.belief.names:
             s.belief.drop(("b", j))
-            s.belief.add(("b", j), 0.0, TAU**2 + self.life.own)
+            if variance:
+                s.belief.add(("b", j), 0.0, variance)
 
     def doubt_ego(self):
         """Where none was ever trusted, but most err alike, the ego errs: it goes where they see it."""
@@ -763,9 +767,8 @@ class Oracle:
         return self.speak_for(t, b.x[b.at("x", self.ego)] + self.dt * u, fix) <= 0
 
     def speak_for(self, t, here: Floats, there: Floats):
-        """How many more neighbours put the ego at one place than at another?"""
-        near = [sum(q < FIX_GATE for q in self.off(t, at)) for at in (here, there)]
-        return near[0] - near[1]
+        """How much nearer do neighbours put the ego to one place than to another?"""
+        return sum(self.off(t, there)) - sum(self.off(t, here))
 
     def off(self, t, place: Floats) -> list[float]:
         """How far is a place from where each neighbour puts the ego?"""
@@ -866,7 +869,8 @@ class Oracle:
             self.state.driven += hypot(way[0], way[1])
         if ("o", j) not in b.names:
             return
-        x, o, f, holds = b.at("x", j), b.at("o", j), np.eye(len(b.x)), self.life.holds**steps
+        x, o, f, level = b.at("x", j), b.at("o", j), np.eye(len(b.x)), exp(self.state.level[5])
+        holds = self.life.holds ** (level**2 * steps)
         f[x, o], f[o, o] = by, holds * np.eye(3)
         b.p = f @ b.p @ f.T
         b.x[o] *= holds

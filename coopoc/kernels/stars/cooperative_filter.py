@@ -66,7 +66,6 @@ from .cooperative_state import (
     is_placed,
     measured_whole,
     new_filter,
-    off,
     set_trust,
     speak_for,
 )
@@ -300,10 +299,8 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
         keep = math.exp(-own[DT] / MEMORY)
         doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, model, own) - gap_to_fix(alone, model, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
-        doubts[ALIKE] *= keep
-        for i in range(count):
-            doubts[ALIKE] += off(f, model, own, rows, i, vector_at(f.ego, ANSWER // 3))
-            doubts[ALIKE] -= off(f, model, own, rows, i, vector_at(alone.ego, ANSWER // 3))
+        answers = vector_at(alone.ego, ANSWER // 3), vector_at(f.ego, ANSWER // 3)
+        doubts[ALIKE] = keep * doubts[ALIKE] + speak_for(f, model, own, rows, count, *answers)
         loudest = max(f.ego[LEVEL], f.ego[LEVEL + 1], f.ego[LEVEL + 2])
         if (
             (loudest > LOUDEST_NOISE or doubts[ALIKE] > AGAINST)
@@ -399,12 +396,13 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
         expect(f.h, c, own[FIX + c], level * own[FIX_VARIANCE + c])
     q = innovate(f.g, f.h)
     if f.member[0, EXTRA_VARIANCE] == 0.0:
-        learn_fix(f, FIXES)
+        learn_fix(f, model, FIXES)
         show(f)
         if model.fix_gate > 0.0 and goes_back(f, model, own, rows, count, q):
             fix_terms(f, 0)
             q = innovate(f.g, f.h)
-    f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
+    spoken = speak_for(f, model, own, rows, count, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
+    f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q, spoken >= 0.0)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)
 

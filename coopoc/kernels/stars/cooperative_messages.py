@@ -183,8 +183,8 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
         q = innovate(g, f.h)
         known = again and f.member[k, EXTRA_VARIANCE] == 0.0
         if known and status[TRUSTED] > 0.0 and sum(f.h.block[MEASURED:]) == 3:
-            learn_fix(f, MESSAGES)
-        f.member[k, OUT + 3] = use_fix(f, model, k, again, q)
+            learn_fix(f, model, MESSAGES)
+        f.member[k, OUT + 3] = use_fix(f, model, k, again, q, True)
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
@@ -238,7 +238,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
 
 
 @inner
-def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
+def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
     information that it keeps.
 
@@ -248,6 +248,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         k: slot.
         again: whether it is not the vehicle's first one.
         q: of `innovate`.
+        supported: whether nothing speaks against the estimate, and for the fix.
     """
     g, h, j, used = f.g, f.h, f.who[k, VEHICLE], sum(f.h.block[MEASURED:])
     if f.member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
@@ -256,15 +257,18 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         return 1.0
     judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
-        if f.status[j, TRUSTED] > 0.0:
+        if not supported:  # neighbours see the ego where the fix is
+            gap = vector_at(h.three, GAP // 3)
+            widen(g, 0, inner_product(gap, gap) / 3.0)
+        elif f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        set_trust(f, j, 0.0, TAU**2 + model.own)
+        set_trust(f, j, 0.0 if supported else 1.0, (TAU**2 if supported else 0.0) + model.own)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             f.member[0, LOCKED] = 0.0
             fix_terms(f, 0)
             innovate(g, h)
             correct(g, h, 1.0)
-        return 0.0
+        return 0.0 if supported else 1.0
     gap = vector_at(h.three, GAP // 3)
     q = min(q, inner_product(gap, gap) / SLIP)
     own, noise = 1e-12, 0.0
@@ -276,7 +280,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     if model.fix_gate > 0.0:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
-        if not judged and f.ego[AGREED] >= ESTABLISHED:
+        if not judged and f.ego[AGREED] >= ESTABLISHED and model.absent[0] > -math.inf:
             f.member[0, LOCKED] = min(f.member[0, LOCKED], MAX_LOCKOUT)
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)

@@ -74,7 +74,7 @@ class Model(NamedTuple):
         heading: rad^2 of the compass's noise.
         offset: m^2, of what all the ego's ranges are too long by.
         turn: (3,) rad^2, 1 and s^2, of errors of heading and scale of an odometry and of a clock; zeros for none.
-        lasts: s, their correlation time.
+        lasts: s, their correlation time, where the level of motions is 1.
         ranged: (2,) of the scale of ranges, and m^2 of the offset of those of a pair; zeros for none.
         absent: (6,) log odds that an error of heading, scale, clock, compass, range or its scale is not there.
         exact: log odds a vehicle that no odometry errs, where each error of heading and scale is there otherwise.
@@ -278,12 +278,11 @@ def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats, count: int) 
 
 @part
 def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, here: Vector, there: Vector) -> float:
-    """By how many more neighbours, as they send their positions and the ego measures them, it is at one place than at
-    another: what the star has made of them does not count."""
+    """How much nearer neighbours, as they send their positions and the ego measures them, put it to one place than to
+    another, as squared normalised distances: what the star has made of them does not count."""
     more = 0.0
     for i in range(count):
-        more += 1.0 if off(f, model, own, rows, i, here) < FIX_GATE else 0.0
-        more -= 1.0 if off(f, model, own, rows, i, there) < FIX_GATE else 0.0
+        more += off(f, model, own, rows, i, there) - off(f, model, own, rows, i, here)
     return more
 
 

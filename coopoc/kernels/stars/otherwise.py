@@ -137,7 +137,8 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     f.ego[LEFT + 6] += math.sqrt(way[0] ** 2 + way[1] ** 2) if k == 0 else 0.0
     if not has(g, k, TURN):
         return
-    i, n, keep = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(-dt / model.lasts)
+    i, n, level = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(f.ego[LEVEL + MOTIONS])
+    keep = math.exp(-level * level * dt / model.lasts)
     for c in range(2):
         for j in range(n):
             g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
@@ -480,19 +481,21 @@ def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> No
 
 
 @part
-def learn_fix(f: Filter, kind: int) -> None:
-    """Count the innovation of a fix."""
+def learn_fix(f: Filter, model: Model, kind: int) -> None:
+    """Count the innovation of a fix: what it has in common with the one before is motion's, where odometry surely errs;
+    what jumps says nothing of motion."""
     h, innovation2, change2, r, s = f.h, 0.0, 0.0, 0.0, 0.0
     for c in range(3):
         innovation2 += h.three[GAP + c] * h.three[GAP + c]
         change2 += (h.three[GAP + c] - f.ego[BEFORE + c]) ** 2
         r += h.three[VARIANCE + c]
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
-    wild = kind == FIXES and innovation2 > SUDDEN * s
+    more, wild = min(innovation2 / s, SUDDEN) - 1.0, innovation2 > SUDDEN * s
     displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < MAX_LOCKOUT)
-    more = min((0.5 * change2 if displaced else innovation2) / s, SUDDEN) - 1.0
-    learn(f, kind, more, r / s, 3.0)
-    if kind == FIXES and not wild:  # what is wild says nothing of motion
+    of_noise = kind == FIXES and (displaced or model.absent[0] == -math.inf)
+    learn(f, kind, min(0.5 * change2 / s, SUDDEN) - 1.0 if of_noise else more, r / s, 3.0)
+    jumped = wild and (f.ego[JUMPED] > 0.0 or change2 > 2.0 * SUDDEN * s)
+    if kind == FIXES and not jumped:
         learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)
 
 
