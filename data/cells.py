@@ -29,7 +29,7 @@ COLUMNS = 5000
 USUAL = {
     "vehicle": "vehicle observer robot car agent sender vehicle_id robot_id id name",
     "partner": "partner neighbour neighbor to target subject other anchor receiver landmark",
-    "t": "t time timestamp stamp seconds datetime utc",
+    "t": "t time timestamp stamp seconds datetime utc tow sow",
     "latitude": "latitude lat",
     "longitude": "longitude lon lng long",
     "height": "height alt altitude",
@@ -74,7 +74,8 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
                     f"must hold at most {LARGEST_TABLE} cells",
                     "Split the drive.",
                 )
-            frame = pd.read_parquet(path).reset_index(drop=True)
+            frame = pd.read_parquet(path)
+            frame = frame.reset_index(drop=frame.index.name is None)
         elif ending == ".jsonl":
             lines = path.read_text("utf-8-sig").splitlines()
             frame = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
@@ -85,7 +86,8 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
         raise _no_table(path, said(error)) from None
     frame.columns = pd.Index([str(name).strip() for name in frame.columns])
-    frame = frame.iloc[:, 1:] if list(frame.columns[:1]) == [""] else frame  # an index, as pandas writes it
+    if "" in frame and (frame.columns[0] == "" or frame[""].isna().all()):
+        frame = frame.drop(columns="")  # an index, as pandas writes it, or what is behind a last comma
     _check_header(path, list(frame.columns))
     frame.index += 1
     return frame
@@ -147,7 +149,7 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
                 error.field,
                 error.value,
                 "must be seconds, or a date as 2024-05-01T12:00:00Z",
-                "Mend the cell, or remove the row.",
+                "Mend the cell, or remove the row; if all are so, convert them by pandas.to_datetime.",
             ) from None
     _refuse(column_values, column_values.isna().to_numpy(), file, "must be a time")
     if kind == "m":
@@ -321,5 +323,5 @@ def _no_table(path: Path, actual: str) -> InputError:
         path.name,
         actual,
         "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet",
-        "Export it again as CSV in UTF-8, without empty rows and columns.",
+        "Export it again as CSV in UTF-8, unpacked, that begins with the header, without empty rows and columns.",
     )

@@ -9,11 +9,12 @@ import numpy as np
 
 from coopoc import InputError, MissingLibraryError
 
-from .log.units import Rows, Summary, rows_of
+from .log.units import Rows, Summary, of_kinds
 
 KNOT, DAY = 1852 / 3600, 86400.0
 LATITUDE, LONGITUDE = re.compile(r"\d\d[0-5]\d(\.\d*)?"), re.compile(r"\d{3}[0-5]\d(\.\d*)?")
 """Degrees and minutes: the parser takes the last digits before the point for minutes, however many there are."""
+FIX = "latitude", "longitude", "height"
 MIN_COURSE_SPEED = 0.5
 """m/s, below which a course over ground is noise."""
 
@@ -57,22 +58,22 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             summary.leave(reason, 1)
         elif reason:
             summary.refuse(reason, 1, where)
-    if not sentences.rows:
+    frame = pd.DataFrame.from_dict(sentences.rows, orient="index")
+    if FIX[0] not in frame:
         raise InputError(
             path.name, "0 fixes", "must hold NMEA sentences $..GGA", "Check that it holds GGA sentences with a fix."
         )
-    frame = pd.DataFrame(sentences.rows, columns=["t", "kind", "value", "row"]).set_index("row")
-    frame["std"] = [sentences.std.get((t, kind), np.nan) for t, kind in zip(frame["t"], frame["kind"], strict=True)]
+    stds = [name for name in map(str, frame) if name.endswith("_std")]
+    frame[stds] = frame.groupby("t")[stds].transform("last")
     early = frame["t"] < sentences.first_day  # sentences before the first date are of its day
-    return rows_of(frame.assign(t=frame["t"] + sentences.first_day * early, vehicle=path.stem), path.name)
+    return of_kinds(frame.assign(t=frame["t"] + sentences.first_day * early, vehicle=path.stem), path.name)
 
 
 class _Sentences:
     """What sentences say; seconds since 1970 from the first date on, else seconds of the first day."""
 
     def __init__(self) -> None:
-        self.rows: list[tuple[float, str, float, int]] = []
-        self.std: dict[tuple[float, str], float] = {}
+        self.rows: dict[int, dict[str, float]] = {}
         self.day, self.last, self.first_day = 0.0, -np.inf, 0.0
 
     def add(self, s: Any, number: int) -> str:
@@ -85,20 +86,18 @@ class _Sentences:
                 raise ValueError("latitude and longitude must be ddmm.mmm and dddmm.mmm")
             if not s.quality or s.lat == "" or s.lon == "":
                 return "fixes of quality 0"
-            height = float(s.alt or 0.0) + float(s.sep or 0.0)
-            for kind, value in (("latitude", s.lat), ("longitude", s.lon), ("height", height)):
-                self.rows.append((self.last, kind, float(value), number))
+            values = [s.lat, s.lon, float(s.alt or 0.0) + float(s.sep or 0.0)]
+            row = dict(zip(FIX, map(float, values), strict=True))
         elif s.msgID == "GST":
-            values = [float(value) for value in (s.stdLat, s.stdLong, s.stdAlt)]
-            for kind, std in zip(("latitude", "longitude", "height"), values, strict=True):
-                self.std[self.last, kind] = std if std > 0 else np.nan
-        elif s.msgID == "RMC" and s.status != "A":
+            stds = [float(std) for std in (s.stdLat, s.stdLong, s.stdAlt)]
+            row = {f"{kind}_std": std if std > 0 else np.nan for kind, std in zip(FIX, stds, strict=True)}
+        elif s.status != "A":
             return "velocities that the receiver calls invalid"
-        elif s.msgID == "RMC":
-            speed = float(s.spd or 0.0) * KNOT
-            self.rows.append((self.last, "speed", speed, number))
-            if s.cog not in ("", None) and speed > MIN_COURSE_SPEED:
-                self.rows.append((self.last, "compass_deg", float(s.cog), number))
+        else:
+            row = {"speed": float(s.spd or 0.0) * KNOT}
+            if s.cog not in ("", None) and row["speed"] > MIN_COURSE_SPEED:
+                row["compass_deg"] = float(s.cog)
+        self.rows[number] = {"t": self.last, **row}
         return ""
 
     def _clock(self, time: Any, date: Any) -> None:

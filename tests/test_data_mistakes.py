@@ -223,6 +223,18 @@ def parts(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("name", ["t", ""])
+def test_a_named_index_is_a_column_and_none_is_behind_the_last_comma(tmp_path, name):
+    frame = pd.DataFrame({"t": [0.0, 1.0, 2.0], "x": [0.0, 9.0, 18.0], "y": 0.0, "vx": 9.0, "vy": 0.0})
+    if name:
+        frame.set_index(name).to_parquet(tmp_path / "a.parquet")
+    else:
+        (tmp_path / "a.csv").write_text(frame.to_csv(index=False).replace("\n", ",\n"))
+    summary = co.read_log(tmp_path).summary
+    assert summary.read["fixes"] == 3
+    assert not summary.unread
+
+
 def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
     """The long table without a word is the reference; names are whole numbers that pandas has written as floats."""
     t, made = np.arange(0, 20, 0.5), {"wide": [], "long": []}

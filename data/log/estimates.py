@@ -1,6 +1,5 @@
 """Errors of a log's clocks, odometry, antennas and pairs, with standard errors by parts of the drive."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -54,12 +53,11 @@ def factors(
     x: AnyArray,
     noise: float,
     groups: Ints | None = None,
-    less: Callable[[Floats], Floats] | None = None,
     z: AnyArray | None = None,
 ) -> Estimate:
     """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, with standard errors by parts
-    that are left out; less the means of groups (M,); times a matrix (k, k) that `less` makes of them, if any. None is
-    known where half of y stays, and that is OUTLYING times its noise: something else is wrong.
+    that are left out; less the means of groups (M,). None is known where half of y stays, and that is OUTLYING times
+    its noise: something else is wrong.
 
     The instruments z (M, k), x itself if not given, are causes without the noise that is in both x and y.
 
@@ -89,8 +87,6 @@ def factors(
     before, left = (np.median(np.abs(gap)) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    turn = np.eye(len(value)) if less is None else less(value)
-    value, *without = (turn @ each for each in (value, *without))
     error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
     return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
 
@@ -275,29 +271,27 @@ def clocks(c: Check, reference: int | None, alike: bool) -> tuple[Estimate, AnyA
         return np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
 
     velocity = np.nan_to_num(c.world.velocity[0])
-    causes = np.arange(size + 2) < size + 2 * alike
-    made, then = (causes * made_by(each) for each in (velocity, following(c, velocity)))
+    columns = np.arange(size + 2)
+    used = (columns < size + 2 * alike) & (columns != reference)
+    made, then = (used * made_by(each) for each in (velocity, following(c, velocity)))
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
-    x, z, groups, less = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there], np.eye(size + 2)
-
-    def against(value: Floats) -> Floats:
-        seen = np.flatnonzero(x[:, :size].any(axis=0))
+    x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
+    value, error = factors(c.relative[there, 0], x, noise, groups, z)
+    seen = np.flatnonzero(ends[there].any(axis=0))
+    error[seen[seen == reference]] = 0.0
+    if reference is None and len(seen):
         apart = np.abs(np.subtract.outer(value[seen], value[seen]))
-        most = seen[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))] if len(seen) else 0
-        less[:size, most if reference is None else reference] -= 1.0
-        return less
-
-    estimate = factors(c.relative[there, 0], x, noise, groups, against, z)
-    return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, x, z, groups, less))), made
+        return clocks(c, seen[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))], alike)
+    return Estimate(value, np.hypot(error, _of_filters(c, there, x, z, groups))), made
 
 
-def _of_filters(c: Check, there: Bools, x: Floats, z: Floats, pairs: Ints, less: Floats) -> Floats:
-    """Standard errors (k,) of factors of causes x (M, k) by instruments z (M, k), less means of pairs (M,), times
-    `less` (k, k), by errors of the filters that decay in the time that a fix is remembered."""
+def _of_filters(c: Check, there: Bools, x: Floats, z: Floats, pairs: Ints) -> Floats:
+    """Standard errors (k,) of factors of causes x (M, k) by instruments z (M, k), less means of pairs (M,), by errors
+    of the filters that decay in the time that a fix is remembered."""
     x, z = _centred(x, pairs), _centred(z, pairs)
-    gain = z @ np.linalg.pinv(z.T @ x).T @ less.T
+    gain = z @ np.linalg.pinv(z.T @ x).T
     keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
     position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
     variance = np.zeros(x.shape[1])

@@ -1,6 +1,6 @@
 """Clock offsets, SI units and the local east-north-up frame of a log's rows; the sensor noise that they state."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +10,10 @@ import pymap3d
 
 from coopoc import InputError, Sensors
 from coopoc.arrays import Bools, Floats
-from coopoc.world.fleet import columns
 from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD
+from ..cells import factors
 from .units import ANGLES, KINDS, Rows, Summary, in_group, only, place, stated_std
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     """
     if rows["t"].isna().all():
         raise InputError("t", "in no file", "must be a column of some table", "Give the times of what was measured.")
-    columns("clock", clock, sorted(rows["vehicle"].unique()))
+    clock = factors(clock, sorted(rows["vehicle"].unique()), "clock")
     ahead, partner_ahead = (rows[who].map(clock).fillna(0.0) for who in ("vehicle", "partner"))
     t = (rows["t"].fillna(rows["t"].min()) - ahead).round(6)
     rows = rows.assign(t=t, arrival=rows["arrival"] - partner_ahead)
@@ -145,7 +145,9 @@ def _nowhere(rows: Rows) -> Bools:
     return np.asarray(rows.set_index(key).index.isin(none) & in_group(rows, "fix"))
 
 
-def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: "Sequence[Member]") -> Sensors:
+def assumed(
+    rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: "Sequence[Member]", drifts: float
+) -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
@@ -156,7 +158,8 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         body: whether the recording is in body frames.
         summary: takes what is assumed.
         dt: s, of the recording.
-        members: of the log; where fixes have shown all velocities, the one that wanders least gives the noise of all.
+        members: of the log.
+        drifts: m^2/s, by which the vehicle that wanders least does, as fixes have shown its velocity.
     """
     base, used = Sensors(), set(rows["kind"])
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
@@ -185,7 +188,6 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
     derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], axis=0).tolist()
-    drifts = least_wander(members)
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
     elif derived and "bearing" in used:
@@ -213,12 +215,6 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
                 f"{floor:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds"
             )
     return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
-
-
-def least_wander(members: "Iterable[Member]") -> float:
-    """m^2/s, by which the position of the vehicle that wanders least does, as fixes have shown its velocity; 0 where
-    one has odometry."""
-    return min((member.heading.wanders for member in members if not member.stands), default=0.0)
 
 
 def fix_factors(rows: Rows, ids: Sequence[str], steps: "Steps") -> Floats:

@@ -110,16 +110,15 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     return at
 
 
-def heading_of_courses(velocity: Signal, yaw_rate: Signal | None) -> HeadingAt:
-    """Function from times (G,) s to headings (G,) rad: the last course before, turned by the yaw rate since then; NaN
+def heading_until(heading: Signal, yaw_rate: Signal | None) -> HeadingAt:
+    """Function from times (G,) s to headings (G,) rad: the last one before, turned by the yaw rate since then; NaN
     before the first.
 
-    >>> heading = heading_of_courses(Signal(np.array([1.0, 2]), np.array([[2.0, 0, 0], [0, 2, 0]])), None)
-    >>> heading(np.array([0.0, 1, 1.9, 2])).round(3).tolist()
-    [nan, 0.0, 0.0, 1.571]
+    >>> heading = heading_until(Signal(np.array([1.0, 2]), np.array([[0.0], [1.5]])), None)
+    >>> heading(np.array([0.0, 1, 1.9, 2])).tolist()
+    [nan, 0.0, 0.0, 1.5]
     """
-    east, north = velocity.value[:, :2].T
-    offset = Signal(velocity.t, (np.arctan2(north, east) - _angle(yaw_rate, velocity.t))[:, None])
+    offset = Signal(heading.t, heading.value - _angle(yaw_rate, heading.t)[:, None])
     return lambda at: wrap(held(offset, at)[:, 0] + _angle(yaw_rate, at))
 
 
@@ -145,11 +144,10 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
     known, rate = np.isfinite(heading), way.yaw_rate
     if not known.any():
         return None, False
-    offset = Signal(t, (heading - _angle(rate, t))[:, None])
+    last = heading_until(Signal(t, heading[:, None]), rate)
 
     def at(times: Floats) -> Floats:
-        angle = wrap(held(offset, times)[:, 0] + _angle(rate, times))
-        return np.where(covered(rate.t, times, gap, gap / 2), angle, np.nan)
+        return np.where(covered(rate.t, times, gap, gap / 2), last(times), np.nan)
 
     s, pace = float(np.sqrt(np.median(variance[known]))), float(np.median(np.abs(way.speed.value)))
     wanders = (2.0 * (s * pace) ** 2) ** (2 / 3) * (way.std**2 * float(np.median(np.diff(way.fixes.t)))) ** (1 / 3)

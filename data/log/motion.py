@@ -19,8 +19,8 @@ from .heading import (
     Reckoning,
     Signal,
     heading_at,
-    heading_of_courses,
     heading_of_rates,
+    heading_until,
     step_means,
     unknown,
 )
@@ -332,7 +332,7 @@ def _heading(
         if (moving := (pace > np.maximum(MOVING, SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
             bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
-            courses, std = heading_of_courses(Signal(t, velocity.value[moving]), rate), unsure[moving] / pace[moving]
+            courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
             return Course(courses, source, wanders, float(np.median(std)), t[: len(t) * (rate is None)], float(bends))
     return Course()
 

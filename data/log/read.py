@@ -35,7 +35,7 @@ from ..librsf import is_librsf, read_librsf
 from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import ENU, Origin, assumed, fix_factors, least_wander, local, on_one_clock, unwrapped
+from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
@@ -179,17 +179,15 @@ def read_log(
     >>> read_log(file).recording
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
-    path, body, clock = given_path(path), frame == "body", named("clock", clock or {}, "Give clock={name: s}.")
+    path, body = given_path(path), frame == "body"
     summary, offset = Summary(path.name), named("offset", offset or {}, "Give offset={name: number}.")
     one_of("frame", frame, Frame)
     texts("ignore", ignore)
     instance("any_scale", any_scale, bool, "Give True or False.")
     instance("mutual", mutual, bool, "Give True or False.")
-    clocks = {f"clock of {name}": ahead for name, ahead in clock.items()}
-    for field, value in {"dt": dt, "max_gap": max_gap, **clocks}.items():
+    for field, value in {"dt": dt, "max_gap": max_gap}.items():
         if value is not None:
-            least = -np.inf if field in clocks else 1e-12
-            number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
+            number(field, value, 1e-12, allowed="a number > 0 s", hint="Give seconds.")
     if origin is not None:
         origin_array = checked("origin", origin, "(3,)", (3,))
         refuse(
@@ -226,7 +224,7 @@ def read_log(
         summary.assume("origin= has no effect: no fix is in degrees")
     summary.rows = int((rows["true"] == 0).sum())
     rows, true_rows = not_vague(rows[rows["true"] == 0], summary), rows[rows["true"] == 1]
-    rows, origin = local(on_one_clock(rows, clock), origin, summary)
+    rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
     deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
@@ -269,9 +267,10 @@ def _recording(
     names = ("gnss", "velocity", "yaw_rate", "compass")
     gnss, velocity, yaw_rate, compass = (stacked(members, name)[None] for name in names)
     factor = np.empty(0) if body or sensors else fix_factors(rows, ids, steps)
-    wander = stacked(members, "wander") - least_wander(members.values())
-    uncertain = wander.clip(0.0) if wander.max() > 0.0 and not sensors else np.empty(0)
-    sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
+    wander = stacked(members, "wander")
+    least = float(wander[:, [not member.stands for member in members.values()]].min(initial=wander.max()))
+    uncertain = (wander - least).clip(0.0) if wander.max() > least and not sensors else np.empty(0)
+    sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()], least)
     return Recording(
         ids=ids,
         t=steps.grid,
