@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from conftest import refused
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from coopoc import V2X, JointFilter, Kalman, Sensors, load_fleet, observe, rt_le
 from coopoc.evaluate import statistics
+from coopoc.evaluate.metrics import alignment_error
 from coopoc.evaluate.statistics import mean_interval, over_seeds, paired_difference
 
 
@@ -87,3 +89,14 @@ def test_what_cannot_be_averaged_is_named():
         paired_difference(np.ones((2, 3, 4)), np.ones((2, 3, 4)))
     with refused("at least two seeds"):
         over_seeds(np.ones((1, 3)))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_alignment_is_scipys(side):
+    """A turn and a shift, also where a reflection would fit better."""
+    rng = np.random.default_rng(8)
+    estimate = rng.normal(size=(50, 3)) * [9, 5, 1]
+    truth = Rotation.from_rotvec([0.3, -0.2, 2.0]).apply(estimate * [1, 1, side])
+    truth += rng.normal([40, -7, 3], 0.1, truth.shape)
+    _, left = Rotation.align_vectors(truth - truth.mean(axis=0), estimate - estimate.mean(axis=0))
+    assert alignment_error(estimate, truth) == pytest.approx(left / np.sqrt(50))

@@ -299,6 +299,12 @@ def test_estimates_of_others_are_refused(change):
         scored(Changed(change=change), SEEN, ["a", "b"], FLEET)
 
 
+def test_a_vehicle_without_a_truth_is_scored_by_innovations():
+    found = scored(co.Kalman(), SEEN, ["a", "b"], without(FLEET, (slice(None), 0)))
+    assert np.isfinite(found["innovation_m"]).all()
+    assert "rt_le_m" not in found
+
+
 def test_a_method_that_knows_later_measurements_is_not_causal():
     late = Changed(change=lambda track: replace(track, x=track.x + track.x[:, -1:]))
     assert causal(co.JointFilter(), SEEN, ["a", "b"])
