@@ -81,6 +81,8 @@ def run(
     study = find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
     for first in points(study)[:1]:
         study.key({**study.settings, **first})
+    if tracks == "tum":
+        study.tracks_of()
     from .study.publish import tables
     from .study.run import plan, run_study, write_tracks
 

@@ -89,7 +89,7 @@ def test_mirroring_keeps_motion_and_noise():
 
 @pytest.mark.parametrize(
     ("field", "options"),
-    [("start", {"start": "zero"}), ("piece", {"piece": 1}), ("fleet", {"piece": 100})],
+    [("start", {"start": "zero"}), ("piece", {"piece": 1}), ("fleet", {"piece": 100}), ("split", {"split": 1.0})],
 )
 def test_clients_refuse_what_cannot_be(field, options):
     with refused(field):

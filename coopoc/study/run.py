@@ -84,12 +84,11 @@ def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params 
         InputError: a study whose cells have no estimates.
     """
     study, cells, folder = _resolve(study, out, settings)
-    if study.tracks is None:
-        raise InputError("tracks", study.name, "has cells without estimates of vehicles", "Take side_by_side.")
-    (folder := folder / "tracks").mkdir(parents=True, exist_ok=True)
+    tracks, folder = study.tracks_of(), folder / "tracks"
+    folder.mkdir(parents=True, exist_ok=True)
     for cell in cells:
         if store.load(folder.parent, cell.name) is not None:
-            for name, *path in study.tracks(cell.settings):
+            for name, *path in tracks(cell.settings):
                 words = [str(value) for value in cell.params.values()]
                 write_tum(folder / (re.sub(r"[^\w.+-]", "_", "-".join([*words, name])) + ".tum"), *path)
     return folder

@@ -118,6 +118,12 @@ class Study:
             raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
         return cells
 
+    def tracks_of(self) -> Callable[[Params], Iterable[tuple[Any, ...]]]:
+        """`tracks`, or InputError if there are none."""
+        if self.tracks is None:
+            raise InputError("tracks", self.name, "has cells without estimates of vehicles", "Take side_by_side.")
+        return self.tracks
+
     def answers(self, results: "Results") -> dict[str, str]:
         """Findings by key: those whose numbers were run.
 
