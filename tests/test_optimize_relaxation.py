@@ -199,7 +199,6 @@ def test_the_elimination_is_numpys(make, monkeypatch):
     (a,) = small.smallest(L)
     assert a == pytest.approx(np.linalg.eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
     monkeypatch.setattr(reduced, "FORMED_ROWS", 0)
-    monkeypatch.setattr(reduced, "DENSE_ROWS", 0)
     large = Reduced(form)
     assert large.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
     (b,) = large.smallest(L)

@@ -16,10 +16,6 @@ from .qcqp import Multipliers, Quadratic
 
 FORMED_ROWS = 500
 """Up to this many constrained rows C is formed."""
-DENSE_ROWS = 200
-"""Up to this many rows of X all matrices are dense."""
-LOOSE = 1e-10
-"""Share of the largest singular value below which positions are free."""
 ROUNDED = 2.0**-51
 """Share of the diagonal of Q by which C may be off: at most 0.84 of 2^-52 where fractions give the cost."""
 
@@ -62,21 +58,9 @@ class Reduced:
         assert factor is not None  # what could be moved as a whole is not among the rows
         return factor
 
-    @cached_property
-    def _small(self) -> tuple[Floats, Floats] | None:
-        """A, and all rows of X over the constrained ones, by the pseudo-inverse, where a dense matrix is faster."""
-        A, bound = self.problem.rows, self.problem.bound
-        if A.shape[1] > DENSE_ROWS:
-            return None
-        A = A.toarray()
-        free = np.linalg.pinv(A[:, bound:], rcond=LOOSE) @ A[:, :bound]
-        return A, np.concatenate([np.eye(bound), -free])
-
     def _all(self, X: Floats) -> Floats:
         """The constrained rows X and the free ones where the cost is smallest."""
         bound = self.problem.bound
-        if self._small is not None:
-            return self._small[1] @ X
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
         return np.concatenate([X, columns_solved(self._inverse, right)])
 
@@ -88,8 +72,6 @@ class Reduced:
 
     def settle(self, X: Floats) -> Floats:
         """All rows of X: the free ones where the cost is smallest."""
-        if self._small is not None:
-            return self._all(X)
         out = np.zeros((len(self._kept), X.shape[1]))
         out[self._kept] = self._all(X)
         return out
@@ -97,9 +79,8 @@ class Reduced:
     @cached_property
     def matrix(self) -> Floats:
         """C (bound, bound)."""
-        small = self._small
-        moved = self._rows @ self._all(np.eye(self.problem.bound)) if small is None else small[0] @ small[1]
-        return moved.T @ moved
+        moved = self._rows @ self._all(np.eye(self.problem.bound))
+        return np.asarray(moved.T @ moved)
 
     @cached_property
     def scale(self) -> float:

@@ -95,12 +95,10 @@ def exp(w: Floats) -> Floats:
     if w.shape[-1] == 1:
         c, s = np.cos(w), np.sin(w)
         return np.concatenate([c, -s, s, c], axis=-1).reshape(*w.shape[:-1], 2, 2)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    safe = np.where(angle > 1e-8, angle, 1.0)
-    first = np.where(angle > 1e-8, np.sin(safe) / safe, 1.0)
-    second = np.where(angle > 1e-8, 2.0 * np.square(np.sin(0.5 * safe) / safe), 0.5)
-    turn = cross(w)
-    return np.eye(3) + first * turn + second * (turn @ turn)
+    from scipy.spatial.transform import Rotation
+
+    flat = Rotation.from_rotvec(np.array(w).reshape(-1, 3)).as_matrix()  # which takes nothing read-only
+    return np.asarray(flat).reshape(*w.shape, 3)
 
 
 def log(rotation: Floats) -> Floats:
@@ -123,14 +121,6 @@ def nearest_rotation(matrix: Floats) -> Floats:
     left, _, right = np.linalg.svd(matrix)
     left[..., :, -1] *= np.sign(np.linalg.det(left @ right))[..., None]
     return np.asarray(left @ right)
-
-
-def cross(w: Floats) -> Floats:
-    """(..., 3, 3) matrices [w]x with [w]x v = w x v."""
-    matrix = np.zeros((*w.shape, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        matrix[..., j, i], matrix[..., i, j] = w[..., k], -w[..., k]
-    return matrix
 
 
 MAX_ANGLE = 1e6

@@ -1,7 +1,7 @@
 """What ranges alone place: multidimensional scaling, and moves across planes to lower minima."""
 
 from collections.abc import Callable, Iterator
-from itertools import combinations, islice
+from itertools import chain, combinations, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -200,11 +200,12 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
     return [(add, end, body) for add, end, far in zip(adds.tolist(), ends, apart(moved, at), strict=True) if far]
 
 
-def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
-    """Points (n, ambient) to descend from: one body at a time moved, and several together."""
-    x = ranges.x
-    near = [move for move in single if move[0] <= TRIED_COST * (1.0 + len(ranges.nodes) / len(x))][:MAX_DESCENTS]
-    together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
+def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
+    """Points (n, ambient) to descend from: one body at a time moved, and several together; `far`: any one."""
+    x, most = ranges.x, TRIED_COST * (1.0 + len(ranges.nodes) / len(ranges.x))
+    near = [move for move in single if move[0] <= most][:MAX_DESCENTS]
+    several = (combinations(near, size) for size in range(2, len(near) + 1))
+    together = chain(combinations(single if far else near, 1), *several)
     for chosen in islice(together, MAX_DESCENTS):
         y = x.copy()
         for _, there, body in chosen:
@@ -212,7 +213,9 @@ def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
         yield y
 
 
-def across(problem: Problem, x: Floats, descend: Descend, cost: Cost) -> tuple[Floats, int, list[float], list[Ints]]:
+def across(
+    problem: Problem, x: Floats, descend: Descend, cost: Cost, far: bool = False
+) -> tuple[Floats, int, list[float], list[Ints]]:
     """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
     moves led down, the costs of the other ends, and the bodies that ranges or level directions hardly
     distinguish from elsewhere.
@@ -222,6 +225,7 @@ def across(problem: Problem, x: Floats, descend: Descend, cost: Cost) -> tuple[F
         x: (n, ambient) a minimum.
         descend: from a point to a minimum.
         cost: of a point.
+        far: whether moves are tried that add much to the cost before the others have given way.
     """
     ranges, loose, least, count = ranges_of(problem, x), bodies(problem, x), cost(x), 0
     every = loose
@@ -232,7 +236,7 @@ def across(problem: Problem, x: Floats, descend: Descend, cost: Cost) -> tuple[F
         ranges = ranges_of(problem, x)
         single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
         rivals = []
-        for start in _moves(ranges, single):
+        for start in _moves(ranges, single, far):
             end = descend(start)
             if (now := cost(end)) < (1.0 - MIN_SAVING) * least - 1e-9:
                 x, least, count = end, now, count + 1

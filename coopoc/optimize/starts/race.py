@@ -1,6 +1,6 @@
 """Multi-start: a few steps of Levenberg-Marquardt from each start, and the lowest goes on."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from .pose_starts import joining
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
-LATER_STEPS = ((3.0, 25), (1.25, 200))
-"""Those whose cost is within the first number of the least go on by as many steps as the second says, of several with
-the same cost the cheapest alone."""
+LATER_STEPS, NEAR_COST = 200, 3.0
+"""Steps by which those go on whose cost is within so many times the least."""
 SAME_COST = 1e-3
 """Share by which costs may differ and count as the same minimum: the cheaper start then stays."""
 RACE_TOLERANCE = 1e-3
@@ -53,7 +52,7 @@ def race(
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
-    All starts are tried, and those whose costs are near the least go on (LATER_STEPS). One start ends the race at once:
+    All starts are tried, and those whose costs are near the least go on. One start ends the race at once:
     its descent is `smooth`, its cost is within its chi-square bound, and either its end is `unwound` or a second start
     led there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to
     the same end, the late starts are tried, one after the other. Where it was smooth, the stated noise is taken to be
@@ -69,7 +68,8 @@ def race(
         draws: whether points and bodies are started from random places, too.
     """
     system, taken, arrived = sparse(problem), 0, True
-    tried, calm, straight, minima = dict[str, tuple[float, Floats]](), list[float](), set[str](), list[float]()
+    tried, reached, straight = dict[str, tuple[float, Floats]](), dict[str, float](), set[str]()
+    calm, minima = list[float](), list[float]()
     mean, variance = expected(problem, system.size)
     usual = EXCESS_STDS * np.sqrt(variance)
     limit = mean + usual
@@ -84,26 +84,29 @@ def race(
         nonlocal taken
         end = arrive(system, x, steps, RACE_TOLERANCE, smooth=smooth)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
+        reached[name] = tried[name][0]
         return end
 
     def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def landed(x: Floats) -> Floats:
-        end = descend(x, LATER_STEPS[-1][1])
+        end = descend(x, LATER_STEPS)
         return end if arrived else np.full_like(end, np.nan)  # which is no minimum
 
-    def ended(name: str, x: Floats) -> tuple[Problem, Search]:
+    def ended(name: str, x: Floats, sure: bool = False) -> tuple[Problem, Search]:
         ends = list[tuple[float, Floats]]()
         if draws:
-            x = descend(x, LATER_STEPS[-1][1])
+            x = descend(x, LATER_STEPS)
             quiet = QUIET_DRAWS if system.cost(x) <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
             y, ends = drawn(scattered(problem, x), x, landed, system.cost, quiet)
             name, x = (name if y is x else "drawn"), y
-        x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
+        far = name not in straight and system.cost(x) > limit
+        x, moves, rivals, doubtful = across(problem, x, descend, system.cost, far)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
+        costs = [*reached.values(), *(each for each, _ in ends), *[cost] * (moves > 0)]
         ends += [(each, x) for each in (*rivals, *minima) if higher(each, cost, SAME_COST)]
-        notes = doubts(x, ends, system.cost)
+        notes = doubts(x, ends, system.cost) or (() if sure else lonely(costs, cost))
         if doubtful and not notes:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
             notes = (f"the measurements fit other places of {names} nearly as well: a lower minimum may exist",)
@@ -117,30 +120,24 @@ def race(
         else:
             calm.append(cost)
             alike = sum(abs(cost - other) <= SAME_COST * cost for other in calm) > 1
-            if (cost <= limit and alike) or (cost <= LATER_STEPS[0][0] * limit and unwound(end.x)):
-                return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost))
+            if (cost <= limit and alike) or (cost <= NEAR_COST * limit and unwound(end.x)):
+                name, x = next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost)
+                return ended(name, x, True)
             straight |= {name} if end.converged else set()
-    if grown in late and not straight and min(cost for cost, _ in tried.values()) > LATER_STEPS[0][0] * limit:
+    if grown in late and not straight and min(cost for cost, _ in tried.values()) > NEAR_COST * limit:
         y, steps = late.pop(grown)(problem)
         y, taken = descend(y), taken + steps
-        tried[grown] = system.cost(y), y
+        tried[grown], reached[grown] = (system.cost(y), y), system.cost(y)
         if explained(y):
             return ended(grown, y)
     for name in rough:
         attempt(name, tried[name][1], FIRST_STEPS)
-    reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
-    for within, steps in LATER_STEPS:
-        if all(cost <= (1.0 + SAME_COST) * least for cost, _ in tried.values()):
-            break
-        tried = _distinct(tried)
-        close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
-        if len(close) > 1:
-            tried.clear()
-            ends = [attempt(name, x, steps) for name, x in close.items()]
-            reached |= {name: cost for name, (cost, _) in tried.items()}
-            minima = [cost for (cost, _), end in zip(tried.values(), ends, strict=True) if end.converged]
-            least = min(reached.values())
+    close = {name: x for name, (cost, x) in tried.items() if cost <= NEAR_COST * least}
+    if max(tried[name][0] for name in close) > (1.0 + SAME_COST) * least:
+        ends = [attempt(name, x, LATER_STEPS) for name, x in close.items()]
+        minima = [reached[name] for name, end in zip(close, ends, strict=True) if end.converged]
+        least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME_COST) * least)
     if name not in straight and not explained(x) and sum(c <= (1.0 + SAME_COST) * least for c in reached.values()) == 1:
         x = descend(x)
@@ -150,10 +147,8 @@ def race(
             y, steps = made(problem.replace_unchecked(x0=frozen(x)))
             taken += steps
             y = descend(y)
-            costs = system.cost(x), system.cost(y)
-            if max(costs) <= LATER_STEPS[0][0] * min(costs):
-                x, y = descend(x), descend(y)
-            name, x = (other, y) if system.cost(y) < (1.0 - SAME_COST) * system.cost(x) else (name, x)
+            reached[other] = system.cost(y)
+            name, x = (other, y) if reached[other] < (1.0 - SAME_COST) * system.cost(x) else (name, x)
     return ended(name, x)
 
 
@@ -203,15 +198,6 @@ def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
     return x, taken
 
 
-def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:
-    """Those whose cost differs from that of every one before, which is cheaper."""
-    distinct: dict[str, tuple[float, Floats]] = {}
-    for name, (cost, x) in tried.items():
-        if all(abs(cost - other) > SAME_COST * min(cost, other) for other, _ in distinct.values()):
-            distinct[name] = cost, x
-    return distinct
-
-
 def smooth(end: Arrival) -> bool:
     """Whether the gain ratio of every step was within 1/2 .. 3/2, without damping. An exact Hessian that was not
     positive definite does not count: J^T J goes on from there."""
@@ -249,6 +235,16 @@ def doubts(x: Floats, ends: Iterable[tuple[float, Floats]], cost: Cost) -> tuple
     alike = [y for each, y in ends if not higher(each, least) and np.abs(y - x).max() > SAME_COST * np.abs(x).max()]
     elsewhere = any(cost(0.5 * (x + y)) > least + BARRIER for y in alike)
     return (ELSEWHERE, *notes) if elsewhere else notes
+
+
+def lonely(costs: Sequence[float], least: float) -> tuple[str, ...]:
+    """A note where one of several starts, or none, has led to the least cost.
+
+    >>> lonely([3.0, 2.0, 4.0], 2.0)
+    ('one of 3 starts leads to this minimum: a lower one may exist',)
+    """
+    alone = sum(not higher(each, least, SAME_COST) for each in costs) < 2 <= len(costs)
+    return (f"one of {len(costs)} starts leads to this minimum: a lower one may exist",) * alone
 
 
 def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
