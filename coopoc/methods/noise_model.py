@@ -139,40 +139,30 @@ class NoiseModel:
             inbox: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
             first: step at which the filter begins.
         """
-        variance = self._of_speed(recording, columns, inbox, first)
+        velocity, links, dt = recording.velocity, recording.links, recording.dt
+        followed = slice(None) if columns is None or inbox is not None else columns
+        if self.process_std is not None:
+            variance: Floats = np.square(self.process_std)[None, None, None]
+        elif self.fleet is not None and self.sensors is not None:
+            self.fleet.require(recording.ids, recording.t)
+            variance = np.square(dt * self.sensors.velocity_std(self.fleet.velocity[None, :, followed], 1e-6))
+        elif inbox is None:
+            variance = own_variances(motion_noise(self, dt), velocity[:, :, followed], dt, first)
+        else:
+            use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[inbox.link]
+            use[:, links.step[inbox.link], neighbour] = RECEIVED * (inbox.arrival >= 0)
+            use[np.arange(len(use))[:, None], inbox.newest, neighbour] = (
+                HELD  # -1, of none: the last step is before no other
+            )
+            use[:, :, columns] = HELD
+            velocity, longest = np.ascontiguousarray(velocity), recording.v2x.max_age
+            variance = process_variances(motion_noise(self, dt), velocity, use, longest, dt)
         stated = self.process_std is None and recording.motion_variance.size > 0
         for more in (self.extra, recording.motion_extra[None, ..., 0] if stated else None):
             if more is not None:
                 # of neighbours, too: what they send of fixes and velocities shows the same to who receives it
-                variance = variance + (more if columns is None or inbox is not None else more[:, :, columns])[..., None]
+                variance = variance + more[:, :, followed, None]
         return variance
-
-    def _of_speed(
-        self, recording: Recording, columns: Sequence[int] | Ints | None, inbox: Inbox | None, first: int
-    ) -> Floats:
-        """`process_variance` but what is more at some steps."""
-        if self.process_std is not None:
-            return np.square(self.process_std)[None, None, None]
-        assert self.sensors is not None
-        velocity, links = recording.velocity, recording.links
-        if self.fleet is not None:
-            self.fleet.require(recording.ids, recording.t)
-            velocity = self.fleet.velocity[None]
-        if columns is not None and inbox is None:
-            velocity = velocity[:, :, columns]
-        if self.fleet is not None:
-            variance: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
-            return variance
-        if inbox is None:
-            return own_variances(self.sensors.motion_noise(recording.dt), velocity, recording.dt, first)
-        use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[inbox.link]
-        use[:, links.step[inbox.link], neighbour] = RECEIVED * (inbox.arrival >= 0)
-        use[np.arange(len(use))[:, None], inbox.newest, neighbour] = (
-            HELD  # -1, of none: the last step is before no other
-        )
-        use[:, :, columns] = HELD
-        velocity, longest = np.ascontiguousarray(velocity), recording.v2x.max_age
-        return process_variances(self.sensors.motion_noise(recording.dt), velocity, use, longest, recording.dt)
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""

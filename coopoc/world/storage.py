@@ -22,8 +22,16 @@ from .sensors import Sensors
 from .v2x import V2X
 
 ARRAYS = (
-    *("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks"),
-    *("fix_factor", "motion_variance"),
+    "t",
+    "gnss",
+    "velocity",
+    "relative",
+    "broadcasts",
+    "arrival",
+    "observers",
+    "landmarks",
+    "fix_factor",
+    "motion_variance",
 )
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")

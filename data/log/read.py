@@ -228,8 +228,9 @@ def read_log(
     deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
-    if not any_scale:
-        _check_scale(rows, path.name)
+    paths = [samples(group, ("x", "y"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
+    if not any_scale and any(len(t) for t, _ in paths):
+        check_scale(paths, path.name)
     ids = _ids(rows, body, summary)
     carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
@@ -389,14 +390,6 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
             f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
             "Give each drive a folder of its own, and name that.",
         )
-
-
-def _check_scale(rows: Rows, name: str) -> None:
-    paths = [samples(group, ("x", "y"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
-    t = np.concatenate([path.t for path in paths])
-    if len(t):
-        check_time(t, name)
-        check_scale(paths, name)
 
 
 def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
