@@ -162,7 +162,7 @@ def pose_nees(track: Track, fleet: Fleet) -> Floats:
     (5, 2, 1)
     """
     turn = heading_error(track, fleet)
-    error = np.concatenate([(track.x - fleet.position[:, list(track.egos)])[..., :2], turn[..., None]], axis=-1)
+    error = np.concatenate([(track.x - _truth(track, fleet))[..., :2], turn[..., None]], axis=-1)
     solved = np.linalg.solve(pose_covariance(track), error[..., None])[..., 0]
     return np.asarray((error * solved).sum(axis=-1))
 
@@ -254,10 +254,10 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     fixes = np.square(noise.fix_std * recording.fix_scale[1:, egos])
     covariance[..., range(3), range(3)] += fixes + recording.motion_extra[1:, egos]
     if track.heading_covariance is not None:
-        shared, variance = track.heading_covariance[:, :-1, :, :3], track.heading_covariance[:, :-1, :, 3, None, None]
+        shared, variance = np.split(track.heading_covariance[:, :-1], [3], axis=-1)
         aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])
-        cross = shared[..., :, None] * aside[..., None, :]
-        covariance += cross + np.swapaxes(cross, -1, -2) + variance * aside[..., :, None] * aside[..., None, :]
+        half = (shared + 0.5 * variance * aside)[..., None] * aside[..., None, :]
+        covariance += half + np.swapaxes(half, -1, -2)
     squares, d = np.full(innovation.shape[:3], np.nan), innovation[:, 1:]
     square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
     squares[:, 1:] = square / dimensions(recording)

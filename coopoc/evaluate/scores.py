@@ -125,10 +125,7 @@ def online_columns(track: Track, recording: Recording, method: Method) -> dict[s
 
 def _errors(track: Track, drive: Fleet, recording: Recording, quantiles: int) -> dict[str, AnyArray]:
     """Columns of errors that need no average over runs."""
-    columns = {
-        "rt_le_m": rt_le(track, drive),
-        "max_error_m": max_error(track, drive),
-    }
+    columns = {"rt_le_m": rt_le(track, drive), "max_error_m": max_error(track, drive)}
     if quantiles:
         error = errors(track, drive)
         quantile = np.quantile if np.isfinite(error).all() else np.nanquantile

@@ -150,14 +150,18 @@ def _work(
     todo = schedule(todo, study.shares, jobs)
     failed = 0 if retry_failed else len(before)
     outcomes = compute(study.cell, todo, jobs)
-    total, done = len(cells), len(cells) - len(todo)
+    count = len(cells)
     with (
         progress_bar(
-            total=total, initial=done, desc=study.name, unit="cell", smoothing=0.05, disable=not progress
+            total=count,
+            initial=count - len(todo),
+            desc=study.name,
+            unit="cell",
+            smoothing=0.05,
+            disable=not progress,
         ) as bar,
         closing(outcomes),
     ):
-        bar.set_postfix_str(f"{failed} failed" if failed else "")
         for outcome in outcomes:
             store.save(folder, outcome)
             failed += outcome.rows is None

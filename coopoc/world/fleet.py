@@ -174,8 +174,7 @@ def names(ids: Iterable[object]) -> tuple[str, ...]:
     for name in texts:
         if not name.strip() or not name.isprintable():
             raise InputError("ids", shown(name), "must be printable", "Remove line ends and control characters.")
-    if len(set(texts)) != len(texts):
-        twice = sorted(i for i, count in Counter(texts).items() if count > 1)
+    if twice := sorted(i for i, count in Counter(texts).items() if count > 1):
         raise InputError("ids", twice[:3], "must be unique", "Rename the vehicles that share an id.")
     return texts
 
