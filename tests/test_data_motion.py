@@ -139,6 +139,13 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
         assert error(course_of_fixes, method) < 1.3 * alone
 
 
+@pytest.mark.parametrize("std", [0.05, 1.5])
+def test_the_speed_of_a_slow_robot_is_along_its_course(tmp_path, std):
+    pace = np.linalg.norm(np.gradient(path("robot"), 0.1, axis=0), axis=1)
+    alone = error(log(tmp_path / "fixes", "robot", std, 10)[0], co.Kalman())
+    assert error(log(tmp_path / "speed", "robot", std, 10, speed=pace)[0], co.Kalman()) < 1.1 * alone
+
+
 @pytest.mark.parametrize("method", [co.Kalman(), co.CooperativeFilter()])
 def test_a_course_that_is_held_without_fixes_is_lost_on_bends(tmp_path, method):
     """Behind a tunnel of half a minute, without a gyro."""

@@ -385,7 +385,8 @@ def _of_fixes(c: Check) -> list[str]:
         row: Mapping[str, Any] = next((row for row in c.vehicles if row["vehicle"] == name), {})
         finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
         every_one = np.zeros(finite.sum(), int)
-        for share in ([1, 1, 1], [0, 0, 1]):  # without an arm that is sure a clock may explain it all
+        shown = truth is None and c.shown(column)
+        for share in ([1, 1, 1], [0, 0, 1])[shown:]:  # without an arm that is sure a clock may explain it all
             x, z = (each[:, finite, column].T * share for each in (made, then))
             factor, std = factors(off[finite, column], x, usual, every_one, z=z)
             sure = np.abs(factor) > OFFSET_ERRORS * std * max(row.get("nis") or 1.0, 1.0) ** 0.5
@@ -406,7 +407,7 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND):
             continue
-        derived = truth is None and (c.shown(column) or _off(row))  # what draws aside draws along a bend, too
+        derived = shown or (truth is None and _off(row))  # what draws aside draws along a bend, too
         if sure[2] and abs(lag := factor[2]) >= LEAST_LAG and not derived:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(

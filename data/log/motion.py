@@ -30,6 +30,8 @@ BETWEEN = (0.25, 0.5, 0.75)
 """Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
+OF_FASTEST = 0.25
+"""Share of its largest speed, below which what is slower than that has no course."""
 SHOWN_STDS = 3.0
 """Standard deviations of a velocity that fixes have shown, above which it is one."""
 STANDS = 0.5
@@ -184,7 +186,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing = _heading(measured, world, shown, derived, turn, ever)
+        pointing = _heading(measured, world, shown, derived, way, ever)
         if pointing.at is unknown or not np.isfinite(off).all():
             raise InputError(
                 f"antenna of {name}",
@@ -212,7 +214,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
                 )
         summary.refuse("world velocities in body frames", only(rows, "vx", "vy", "vz"))
         signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
-        along = _heading(measured, None, shown, derived, turn, steps)
+        along = _heading(measured, None, shown, derived, way, steps)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         moves: Floats = forward * turned(AHEAD, along.at(grid))
         velocity: Floats = forward * AHEAD
@@ -281,7 +283,7 @@ def _in_world(
     derived."""
     summary, speed = steps.summary, way.speed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), only(rows, "speed")
-    heading = _heading(measured, world, shown, derived, way.yaw_rate, steps)
+    heading = _heading(measured, world, shown, derived, way, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), world, heading._replace(wanders=0.0)
@@ -314,11 +316,11 @@ def _in_world(
 
 
 def _heading(
-    measured: Signal, world: Signal | None, shown: Shown, derived: Course | None, turn: Signal, steps: Steps
+    measured: Signal, world: Signal | None, shown: Shown, derived: Course | None, way: Reckoning, steps: Steps
 ) -> Course:
     """Heading that was measured, else by the yaw rate and fixes, else the course of the velocities in the world that
     were measured, else of those that fixes have shown."""
-    rate = turn if len(turn.t) > 1 else None
+    rate = way.yaw_rate if len(way.yaw_rate.t) > 1 else None
     if len(measured.t):
         return Course(heading_at(measured, rate, steps.gap(measured.t)))
     if derived is not None:
@@ -329,7 +331,9 @@ def _heading(
         sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
-        if (moving := (pace > np.maximum(MOVING, SHOWN_STDS * unsure)) & certain).any():
+        fastest = np.abs(way.speed.value).max() if len(way.speed.t) else np.inf
+        least = min(MOVING, OF_FASTEST * fastest)
+        if (moving := (pace > np.maximum(least, SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
             bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
