@@ -19,8 +19,8 @@ from .cholesky import Cholesky, DenseCholesky
 
 LIBRARIES = ("scipy.sparse", "coopoc.kernels.graphs.graph_tape", "coopoc.kernels.graphs.multifrontal")
 """What every solve imports late, so that `import coopoc` stays quick."""
-DENSE_UNKNOWNS = 200
-"""Unknowns up to which one dense matrix is as fast."""
+DENSE_UNKNOWNS, SMALL_UNKNOWNS = 60, 200
+"""Unknowns up to which one dense matrix is as fast, and up to which layouts are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ _LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
 
 def shared_layout(structure: Structure) -> Layout:
     """The layout of a structure, shared by its problems."""
-    if structure.nodes * structure.space.dof <= DENSE_UNKNOWNS:
+    if structure.nodes * structure.space.dof <= SMALL_UNKNOWNS:
         return _small(structure)
     if (layout := _LARGE.get(structure)) is None:
         layout = _LARGE[structure] = Layout(structure)
