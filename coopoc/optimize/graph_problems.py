@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import TWO_TURNS, Floats, frozen, instance, one_of
+from ..arrays import TWO_TURNS, Floats, Ints, frozen, instance, one_of
+from ..errors import InputError
 from ..formats import load_graph
 from ..formats.graph import Graph
 from ..kernels.compiling.waiting import clock, load
@@ -207,14 +208,17 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         turns = kind in ("relative_pose", "pose")
         z = Space(d, has_rotation=True).join(edges.position, edges.rotation) if turns else edges.position
         if objective == "geodesic":
+            _check_noise(graph, edges.nodes, np.linalg.eigvalsh(edges.covariance)[:, 0])
             factors.append(Factor(kind, edges.nodes, z, cov=edges.covariance))
             continue
         variance = [position_variance(edges.covariance, d)]
         if turns:
             kind = f"{kind}_chordal"
             variance.append(rotation_variance(edges.covariance, d))
+        _check_noise(graph, edges.nodes, np.min(variance, axis=0))
         std = np.sqrt(variance).repeat([d, d * d][: len(variance)], axis=0).T
         factors.append(Factor(kind, edges.nodes, z, std=std, twice=turns and d == 2))
+    _check_noise(graph, graph.ranges.nodes, graph.ranges.variance)
     ranges, sigma = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
     apart = ranges.distance > 0
     if apart.any():
@@ -223,6 +227,14 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         zero = np.zeros((int((~apart).sum()), d))
         factors.append(Factor("displacement", ranges.nodes[~apart], zero, std=sigma[~apart] + zero))
     return tuple(factors)
+
+
+def _check_noise(graph: Graph, nodes: Ints, variance: Floats) -> None:
+    """InputError unless the least variance (M,) of each measurement is positive."""
+    for k in np.flatnonzero(~(variance > 0))[:1]:
+        whose = " and ".join(graph.names[i] for i in nodes[k])
+        hint = "Give every component a variance, or remove the measurement."
+        raise InputError("covariance", f"of {whose}: least variance {variance[k]:.3g}", "must be positive", hint)
 
 
 def _fixed(graph: Graph) -> tuple[int, ...]:
