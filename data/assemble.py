@@ -285,14 +285,14 @@ def nearest(late: Floats, *keys: Ints | Floats) -> Ints:
     return np.asarray(rows.drop_duplicates(names).index)
 
 
-def steps_of(t: Floats, dt: float, steps: int) -> tuple[Ints, Floats]:
-    """Step of each time (M,) s after the first step, -1 outside the drive, and how far off it is in s.
+def steps_of(t: Floats, dt: float, steps: int) -> Ints:
+    """Step of each time (M,) s after the first step, -1 outside the drive.
 
-    >>> steps_of(np.array([0.21, 9.0]), 0.1, 5)[0]
+    >>> steps_of(np.array([0.21, 9.0]), 0.1, 5)
     array([ 2, -1])
     """
     step = np.rint(t / dt)
-    return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64), np.abs(t - dt * step)
+    return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64)
 
 
 def planar_recording(
@@ -320,8 +320,9 @@ def planar_recording(
         note: of the recording; that inclinations were not measured is added.
     """
     n = len(ids) - len(position)
-    step, late = steps_of(table[:, 0], t[1] - t[0], len(t))
-    table = np.column_stack([step, table[:, 1:]])[nearest(late, step, *table[:, 1:3].T)]
+    dt = t[1] - t[0]
+    step = steps_of(table[:, 0], dt, len(t))
+    table = np.column_stack([step, table[:, 1:]])[nearest(np.abs(table[:, 0] - dt * step), step, *table[:, 1:3].T)]
     table = table[np.lexsort(table[:, [3, 1, 0]].T)]
     links = Links(*table[:, :3].astype(np.int64).T)
     shape = (1, len(t), len(ids), 3)

@@ -171,7 +171,7 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     )
     forward, turn = step_means(speed, t) * [1.0, 0.0], step_means(rate, t)
     rec = planar_recording(("vehicle",), t, forward[:, None], turn, np.empty((0, 2)), np.empty((0, 5)), sensors, "")
-    step, _ = steps_of(fixes.t - t[0], dt, len(t))
+    step = steps_of(fixes.t - t[0], dt, len(t))
     gnss = np.full_like(rec.gnss, np.nan)
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
     runs = np.arange(2 * STARTS)

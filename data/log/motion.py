@@ -94,7 +94,7 @@ class Steps(NamedTuple):
     def nearest(self, t: Floats) -> tuple[Ints, Floats]:
         """Nearest step of each time (M,) s, of two the later one, -1 outside, and how much later than the step the time
         is, s."""
-        step, _ = steps_of(t - self.grid[0] + SAME_INSTANT, self.dt, len(self.grid))
+        step = steps_of(t - self.grid[0] + SAME_INSTANT, self.dt, len(self.grid))
         return step, t - self.grid[step]
 
 
@@ -244,9 +244,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    alone = heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2)
-    summary.shown += [name] * alone
-    wander = _wander(heading if alone and not by_fixes else Course(wanders=heading.wanders), moves, steps)
+    summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2))
+    wander = _wander(heading, moves, steps)
     velocity = velocity + absent[:, None]
     climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
@@ -345,7 +344,7 @@ def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:
     """(T,) m^2/s, by which a position becomes uncertain: `heading.wanders`, and where a course is held for longer than
     fixes are apart, by d/dt of (k s^2 / 2)^2, with the bends k of the way s since then, of s^2 at most."""
     more: Floats = np.zeros(len(moves))
-    if len(heading.shown) > 1:
+    if heading.wanders > 0.0 and len(heading.shown) > 1:
         pace = np.linalg.norm(np.nan_to_num(moves), axis=1)
         way = np.cumsum(pace) * steps.dt
         last = heading.shown[np.searchsorted(heading.shown, steps.grid).clip(1) - 1] + steps.gap(heading.shown)
