@@ -75,9 +75,8 @@ def run(
     from .study.cell import assignments
     from .study.study import find_study, points
 
-    changes = dict(assignments([text for group in set for text in group]))
-    if data is not None:
-        changes["data"] = data
+    chosen = [] if data is None else [f"data={data}"]
+    changes = assignments([*chosen, *(text for group in set for text in group)])
     study = find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
     for first in points(study)[:1]:
         study.key({**study.settings, **first})

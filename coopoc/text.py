@@ -76,6 +76,15 @@ def replaceable(path: Path) -> Path:
     return path
 
 
+def made_folder(folder: Path) -> Path:
+    """`folder`, made if there is none; InputError if it cannot be, which costs less before the work than after."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("out", str(folder), f"cannot be made ({error.strerror})", "Choose another --out.") from None
+    return folder
+
+
 def inside(folder: Path, path: Path) -> Path:
     """`path`, if it stays in `folder` once symbolic links are followed.
 

@@ -15,7 +15,7 @@ import torch
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import listed, number
 from coopoc.plugins import in_file
-from coopoc.text import given_path
+from coopoc.text import given_path, made_folder
 from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 
@@ -81,6 +81,8 @@ def train_all(
     wanted = [job for name in recipes for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
     paths = {job: out / f"{job.label}.safetensors" for job in wanted}
     missing = [job for job, path in paths.items() if not _made(path, job.key(fleet))]
+    if missing:
+        made_folder(out)
     if jobs > 1 and len(missing) > 1:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
             todo = [

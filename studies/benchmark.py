@@ -98,10 +98,9 @@ def benchmark(
             raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
     failed = 0
     for name in methods:
-        began = time.perf_counter()
+        began, file = time.perf_counter(), card_file(name, out, seed, validation)
         made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
-        file = card_file(name, out, seed, validation)
         file.write_text(json.dumps(made, indent=1) + "\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
         print(page([made]))

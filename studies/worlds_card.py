@@ -22,6 +22,7 @@ from coopoc.study.compute import compute
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 from coopoc.study.study import Params, Row
+from coopoc.text import made_folder
 from coopoc.workers import progress_bar
 
 from .lineup import named_method
@@ -103,9 +104,8 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
         named_method(name)
     cards = list[dict[str, Any]]()
     for name in methods:
-        began = time.perf_counter()
+        began, file = time.perf_counter(), card_file(name, out, seed, validation)
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
-        file = card_file(name, out, seed, validation)
         file.write_text(card_text(cards[-1]))
         print(details(cards[-1]), end="\n\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
@@ -116,8 +116,7 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
 def card_file(name: str, out: Path, seed: int | None, validation: bool) -> Path:
     """File of a method's card; in folders of their own those of other draws and of validation, which cannot be
     submitted."""
-    folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = made_folder(out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}"))
     return folder / f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
 
 

@@ -429,6 +429,8 @@ def test_training_refuses_values_from_elsewhere():
     swept(learned.federate, {**federation, **more, "aggregate": "mean"}, few)
     swept(learned.ledger, {"federation": learned.federate(**federation), "overhead": 0}, wrong)
     swept(learned.LearnedGain, {"model": learned.GainNet(), "name": "n", "x0": None}, wrong)
+    with refused("out = /dev/null: cannot be made"):
+        learned.train_all(drive, "/dev/null", recipes=["okf"], seeds=[0], progress=False)
     with refused(r"epochs = 1\.5: must be a whole number"):
         learned.Schedule(epochs=1.5)
 

@@ -106,8 +106,8 @@ def of_training(
     (120.0, 140.0)
     """
     overhead = number("overhead", overhead, 0, 10**9, kind=int, allowed=">= 0 bytes")
-    directions = (("sent", sent), ("received", received))
-    payload = np.array([checked(name, values, "(V,)", (len(names),)) for name, values in directions])
+    count = (len(names),)
+    payload = np.array([checked("sent", sent, "(V,)", count), checked("received", received, "(V,)", count)])
     kinds = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]
     moved = np.stack([kinds, np.zeros_like(kinds)], axis=1)
     return Ledger(tuple(names), np.zeros(len(names)), moved[0], moved[1], tuple(servers))

@@ -78,8 +78,7 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     covariance = track.covariance
     if track.absent is not None:
         covariance = np.where(track.absent[..., None, None], np.eye(3), covariance)
-    arrays = (np.ascontiguousarray(values) for values in (track.x, truth, covariance))
-    squares, sound = normalised(*arrays)
+    squares, sound = normalised(*map(np.ascontiguousarray, (track.x, truth, covariance)))
     _require_sound(track, covariance, squares, method)
     if not sound:
         hint = "Assume noise in every direction: no standard deviation may be zero."

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..arrays import listed
 from ..errors import InputError, unknown
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 __all__ = ["Cell", "Params", "Row", "Scalar", "Study", "find_study"]
+Tracks: TypeAlias = Callable[[Params], Iterable[tuple[Any, ...]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +84,7 @@ class Study:
     limitations: tuple[str, ...] = ()
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
-    tracks: Callable[[Params], Iterable[tuple[Any, ...]]] | None = None
+    tracks: Tracks | None = None
 
     def __post_init__(self) -> None:
         file_name("study", self.name, "Rename the study: its folder has this name.")
@@ -118,7 +119,7 @@ class Study:
             raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
         return cells
 
-    def tracks_of(self) -> Callable[[Params], Iterable[tuple[Any, ...]]]:
+    def tracks_of(self) -> Tracks:
         """`tracks`, or InputError if there are none."""
         if self.tracks is None:
             raise InputError("tracks", self.name, "has cells without estimates of vehicles", "Take side_by_side.")

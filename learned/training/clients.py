@@ -11,7 +11,6 @@ from torch import Tensor
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.arrays import AnyArray, Floats, check_fields, instance, number, one_of
-from coopoc.errors import shown
 from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
@@ -54,18 +53,17 @@ class Segments:
 
     def __post_init__(self) -> None:
         check_fields(self, {"dt": (1e-9, 1e9, "> 0 s")})
-        shape = tuple(getattr(self.truth, "shape", ()))
+        shape = tuple(self.truth.shape)
         for name, wanted in {
             "gnss": shape,
             "velocity": shape,
             "truth": (*shape[:2], 3),
             "true_start": shape[:1],
         }.items():
-            value = getattr(self, name)
-            if not isinstance(value, Tensor) or value.shape != wanted:
+            actual = tuple(getattr(self, name).shape)
+            if actual != wanted:
                 allowed = "must be a tensor (n, T + 1, 3) as the others are, true_start (n,)"
-                actual = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else shown(value)
-                raise InputError(name, actual, allowed, "Make segments with learned.clients(...).")
+                raise InputError(name, f"shape {actual}", allowed, "Make segments with learned.clients(...).")
 
     def __len__(self) -> int:
         return len(self.truth)

@@ -67,6 +67,4 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
 
 def generator(draw: np.random.Generator) -> torch.Generator:
     """A torch generator seeded by a keyed NumPy stream."""
-    made = torch.Generator()
-    made.manual_seed(int(draw.integers(2**62)))
-    return made
+    return torch.Generator().manual_seed(int(draw.integers(2**62)))
