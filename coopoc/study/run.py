@@ -162,6 +162,7 @@ def _work(
         ) as bar,
         closing(outcomes),
     ):
+        bar.set_postfix_str(f"{failed} failed" if failed else "")  # shows the bar where stderr is no terminal, too
         for outcome in outcomes:
             store.save(folder, outcome)
             failed += outcome.rows is None
