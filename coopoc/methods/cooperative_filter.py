@@ -142,7 +142,7 @@ class CooperativeFilter(Checked):
       no vehicle can have reached are replaced by the last ones.
     - *Levels*: the variances of the ego's fixes, its neighbours' fixes, ranges, azimuths, inclinations and motions
       follow their innovations, between 0.14 and 33 times what is assumed, by recursive maximum likelihood
-      (`kernels.stars.otherwise`). Where odometry surely errs, what successive innovations share is motion's.
+      (`kernels.stars.otherwise`). Where odometry surely errs, half of what successive innovations share is motion's.
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
       $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges (of measured ones also their
       scale, and an offset of each pair); those of odometry change the faster, the noisier motions are. Each is a

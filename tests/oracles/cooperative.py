@@ -36,6 +36,7 @@ from coopoc.kernels.stars.otherwise import (
     MAX_LEVEL_CHANGE,
     MIN_LEVEL,
     PRIOR,
+    SHARED,
     SIDEWAYS,
     SLIP_INTERVAL,
     SLIP_LASTS,
@@ -584,8 +585,9 @@ class Oracle:
         total, s = np.trace(cov) + r.sum(), self.state
         change, square = np.square(gap - s.gap).sum() / 2 / total, gap @ gap / total
         wild, established = square > SUDDEN, s.agreed >= ESTABLISHED and s.locked.get(self.ego, 0.0) >= MAX_LOCKOUT
-        of_noise = kind == 3 and (self.life.absent[0] == -inf or (wild and not established))
-        self.learn(kind, min(change if of_noise else square, SUDDEN) - 1, r.sum() / total, 3)
+        shared = 1.0 if wild and not established else SHARED if self.life.absent[0] == -inf else 0.0
+        noise = square - shared * (square - change) if kind == 3 else square
+        self.learn(kind, min(noise, SUDDEN) - 1, r.sum() / total, 3)
         if kind == 3 and not (wild and (s.jumped or change > SUDDEN)):
             self.learn(5, min(square, SUDDEN) - 1, s.made / total, 3)
 
@@ -635,7 +637,7 @@ class Oracle:
             if q > g.fix_gate and hits < PATIENCE:
                 share = g.fix_gate / q if q < HARD_REJECT_FACTOR * g.fix_gate else 0.0
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
-            if not judged and s.agreed >= ESTABLISHED and self.life.absent[0] > -inf:
+            if not judged and s.agreed >= ESTABLISHED and s.level[3] <= 2.9:
                 locked[j] = min(locked[j], MAX_LOCKOUT)
         if share:
             b.updates(h, z, r, share=share)

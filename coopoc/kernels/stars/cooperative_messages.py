@@ -77,7 +77,7 @@ from .gaussian import (
     widen,
 )
 from .messages import block_at, three_of, vector_at
-from .otherwise import drive, learn_fix, score, turned
+from .otherwise import LOUDEST_NOISE, drive, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -280,7 +280,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: b
     if model.fix_gate > 0.0:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
-        if not judged and f.ego[AGREED] >= ESTABLISHED and model.absent[0] > -math.inf:
+        if not judged and f.ego[AGREED] >= ESTABLISHED and f.ego[LEVEL + FIXES] <= LOUDEST_NOISE:
             f.member[0, LOCKED] = min(f.member[0, LOCKED], MAX_LOCKOUT)
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)

@@ -423,6 +423,9 @@ SUDDEN, USUAL = 5.0, 0.95
 """Most of a squared normalised innovation that counts, and the mean of what counts of one number that is as assumed."""
 MIN_LEVEL, MAX_LEVEL, MAX_LEVEL_CHANGE = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
+SHARED = 0.5
+"""Share of what successive innovations of fixes have in common that is motion's, where odometry surely errs: nothing
+tells it from a receiver that drifts."""
 PRIOR = 10.0
 """Information that the assumed level counts as: that of twenty numbers."""
 UNTRUSTED, AGREEING = 30.0, 10.0
@@ -482,8 +485,8 @@ def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> No
 
 @part
 def learn_fix(f: Filter, model: Model, kind: int) -> None:
-    """Count the innovation of a fix: what it has in common with the one before is motion's, where odometry surely errs;
-    what jumps says nothing of motion."""
+    """Count the innovation of a fix: of one that has jumped, only how it differs from the one before is noise, and
+    nothing is motion's."""
     h, innovation2, change2, r, s = f.h, 0.0, 0.0, 0.0, 0.0
     for c in range(3):
         innovation2 += h.three[GAP + c] * h.three[GAP + c]
@@ -492,8 +495,9 @@ def learn_fix(f: Filter, model: Model, kind: int) -> None:
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     more, wild = min(innovation2 / s, SUDDEN) - 1.0, innovation2 > SUDDEN * s
     displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < MAX_LOCKOUT)
-    of_noise = kind == FIXES and (displaced or model.absent[0] == -math.inf)
-    learn(f, kind, min(0.5 * change2 / s, SUDDEN) - 1.0 if of_noise else more, r / s, 3.0)
+    shared, noise = 1.0 if displaced else SHARED if model.absent[0] == -math.inf else 0.0, innovation2
+    noise -= shared * (innovation2 - 0.5 * change2) if kind == FIXES else 0.0
+    learn(f, kind, min(noise / s, SUDDEN) - 1.0, r / s, 3.0)
     jumped = wild and (f.ego[JUMPED] > 0.0 or change2 > 2.0 * SUDDEN * s)
     if kind == FIXES and not jumped:
         learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)
