@@ -424,8 +424,8 @@ SUDDEN, USUAL = 5.0, 0.95
 MIN_LEVEL, MAX_LEVEL, MAX_LEVEL_CHANGE = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
 SHARED = 0.5
-"""Share of what successive innovations of fixes have in common that is motion's, where odometry surely errs: nothing
-tells it from a receiver that drifts."""
+"""Share of what successive innovations of fixes have in common that is motion's, where odometry surely errs: a receiver
+that drifts looks the same."""
 PRIOR = 10.0
 """Information that the assumed level counts as: that of twenty numbers."""
 UNTRUSTED, AGREEING = 30.0, 10.0
@@ -495,8 +495,9 @@ def learn_fix(f: Filter, model: Model, kind: int) -> None:
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     more, wild = min(innovation2 / s, SUDDEN) - 1.0, innovation2 > SUDDEN * s
     displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < MAX_LOCKOUT)
-    shared, noise = 1.0 if displaced else SHARED if model.absent[0] == -math.inf else 0.0, innovation2
-    noise -= shared * (innovation2 - 0.5 * change2) if kind == FIXES else 0.0
+    noise, shared = innovation2, SHARED if model.absent[0] == -math.inf else 0.0
+    if kind == FIXES:
+        noise -= (1.0 if displaced else shared) * (innovation2 - 0.5 * change2)
     learn(f, kind, min(noise / s, SUDDEN) - 1.0, r / s, 3.0)
     jumped = wild and (f.ego[JUMPED] > 0.0 or change2 > 2.0 * SUDDEN * s)
     if kind == FIXES and not jumped:
