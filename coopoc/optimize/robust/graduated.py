@@ -15,7 +15,7 @@ from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
 from ..starts.mirrors import Cost, Descend, across, movable, scaled
-from ..starts.race import QUIET_DRAWS, doubts, drawn, lonely, scattered
+from ..starts.race import QUIET_DRAWS, doubts, drawn, reached_once, scattered
 from .candidates import Inner, Marked, mark
 
 MAX_ROUNDS = 300
@@ -164,7 +164,7 @@ def contest(
         d, (lowest, _) = cauchy.dimension, min(tried, key=lambda end: end[0])
         size = RIVAL_DISTANCE * np.ptp(np.concatenate([y[:, :d] for _, y in tried]), axis=0).max()
         notes = doubts(best_x, [end for end in tried if np.abs(end[1] - best_x)[:, :d].max() > size], cost)
-        notes = *notes, *lonely([each for each, _ in tried], lowest)
+        notes = *notes, *reached_once([each for each, _ in tried], lowest)
         name, least = best if best_x is mirrored_x else "drawn", np.inf
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)

@@ -106,7 +106,7 @@ def race(
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
         costs = [*reached.values(), *(each for each, _ in ends), *[cost] * (moves > 0)]
         ends += [(each, x) for each in (*rivals, *minima) if higher(each, cost, SAME_COST)]
-        notes = doubts(x, ends, system.cost) or (() if sure else lonely(costs, cost))
+        notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
         if doubtful and not notes:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
             notes = (f"the measurements fit other places of {names} nearly as well: a lower minimum may exist",)
@@ -237,14 +237,14 @@ def doubts(x: Floats, ends: Iterable[tuple[float, Floats]], cost: Cost) -> tuple
     return (ELSEWHERE, *notes) if elsewhere else notes
 
 
-def lonely(costs: Sequence[float], least: float) -> tuple[str, ...]:
+def reached_once(costs: Sequence[float], least: float) -> tuple[str, ...]:
     """A note where one of several starts, or none, has led to the least cost.
 
-    >>> lonely([3.0, 2.0, 4.0], 2.0)
+    >>> reached_once([3.0, 2.0, 4.0], 2.0)
     ('one of 3 starts leads to this minimum: a lower one may exist',)
     """
-    alone = sum(not higher(each, least, SAME_COST) for each in costs) < 2 <= len(costs)
-    return (f"one of {len(costs)} starts leads to this minimum: a lower one may exist",) * alone
+    once = sum(not higher(each, least, SAME_COST) for each in costs) < 2 <= len(costs)
+    return (f"one of {len(costs)} starts leads to this minimum: a lower one may exist",) * once
 
 
 def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
