@@ -205,7 +205,7 @@ def load_method(name_or_path: Path | str, net: str = "") -> Method:
     path = shipped.get(name_or_path) if isinstance(name_or_path, str) else None
     path = path or given_path(name_or_path)
     if not path.is_file():
-        raise unknown("learned method", str(name_or_path), shipped)
+        raise unknown("learned method", str(name_or_path), shipped, "Or give the path of a checkpoint that is there.")
     checkpoint = load(path, net)
     return checkpoint.model.method(str(checkpoint.card.get("recipe", path.stem)))
 

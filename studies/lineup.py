@@ -125,7 +125,7 @@ def own(name: str, noise: "NoiseModel | str" = "nominal") -> Any:
     shows = "docs/extend.md shows one; its first argument is noise_model."
     try:
         method = find("coopoc.methods", name)(noise)
-    except TypeError as error:
+    except Exception as error:  # of a class that is not ours
         raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", shows) from error
     if not (isinstance(method, Method) and isinstance(method.name, str) and isinstance(method.message, Message)):
         raise InputError(

@@ -98,7 +98,8 @@ def egos(p: Params) -> tuple[str, ...]:
         chosen = ids[(there[1:] & there[:-1]).any(axis=0)]
     count = min(5, len(chosen)) if wanted == "auto" else int(wanted)
     if not 1 <= count <= len(chosen):
-        raise InputError("egos", wanted, f"must be 1..{len(chosen)}, vehicles that are there", "Take fewer.")
+        allowed = f"must be a number of vehicles, 1..{len(chosen)}, or their ids"
+        raise InputError("egos", wanted, allowed, "Join ids by +.")
     return tuple(chosen[np.arange(count) * len(chosen) // count].tolist())
 
 

@@ -45,7 +45,7 @@ class Solution:
         build_seconds: to prepare the solver and the start.
         solve_seconds: to run it, and of the search for a start: extras["start_seconds"] of them.
         check_seconds: to compute what is here from x.
-        load_seconds: beside these, what this process has waited for libraries and machine code until now.
+        load_seconds: beside these, what this thread has waited for libraries and machine code until now.
         compile_seconds: beside these, what it has waited for kernels to compile, once per machine.
         backend: its name.
         names: of the nodes.

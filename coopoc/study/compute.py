@@ -64,7 +64,7 @@ def attempt(function: Function, cell: Cell) -> Outcome:
 
 def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:
     """Outcomes as they come: here for one job, else from worker processes; WorkerDiedError if one was killed."""
-    if jobs == 1 or len(cells) < 2:
+    if (jobs := min(jobs, len(cells))) < 2:  # loky starts all of its workers
         yield from (attempt(function, cell) for cell in cells)
         return
     for name, value in OF_WORKERS.items():

@@ -88,9 +88,11 @@ class Results:
         """Rows where each named column has the value, or one of a list of values.
 
         Raises:
-            InputError: an unknown column, or a value that no row has.
+            InputError: an unknown column, a value that no row has, or no row at all as every cell failed.
         """
         frame = self.frame
+        if frame.empty and self.failed:
+            raise InputError("results", "no row", f"{self.failed} cells failed", f"{self.failures['reason'][0]}.")
         for name, wanted in {**(where or {}), **also}.items():
             if name not in frame:
                 raise unknown("column", name, frame.columns)

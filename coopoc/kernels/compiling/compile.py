@@ -111,7 +111,7 @@ def _watch() -> None:
             if not self.timers:
                 seconds[_name(event.data["dispatcher"].py_func)] = time.process_time() - self.used
                 _hold_bars(took := clock() - self.began)
-                spent["compile"] += took
+                spent.compile += took
             if self.collects and not self.timers:
                 gc.enable()
 

@@ -3,15 +3,22 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from threading import local
 from time import perf_counter
 
-spent = {"load": 0.0, "compile": 0.0}
-"""s of this process: loading libraries and machine code, and compiling."""
+
+class _Spent(local):
+    """s of this thread: loading libraries and machine code, and compiling. What other threads wait for is not ours."""
+
+    load = compile = 0.0
+
+
+spent = _Spent()
 
 
 def clock() -> float:
-    """s of a clock that stands still while this process loads or compiles."""
-    return perf_counter() - sum(spent.values())
+    """s of a clock that stands still while this thread loads or compiles."""
+    return perf_counter() - spent.load - spent.compile
 
 
 @contextmanager
@@ -21,7 +28,7 @@ def waiting(kind: str) -> Iterator[None]:
     try:
         yield
     finally:
-        spent[kind] += clock() - began
+        setattr(spent, kind, getattr(spent, kind) + clock() - began)
 
 
 def load(*modules: str) -> None:
