@@ -22,8 +22,6 @@ from .errors import InputError, MissingLibraryError, missing, unknown
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 Folder: TypeAlias = Annotated[Path, arg(metavar="FOLDER")]
 Folders: TypeAlias = Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")]
-Metric: TypeAlias = Annotated[str, arg(metavar="METRIC")]
-Chosen: TypeAlias = Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")]
 Format: TypeAlias = Literal["markdown", "csv", "latex", "html"]
 
 _ABOUT = """usage: coopoc COMMAND [options]
@@ -108,12 +106,8 @@ def table(
     /,
     format: Format = "markdown",
     name: Annotated[str | None, arg(metavar="NAME")] = None,
-    rows: Annotated[str | None, arg(metavar="AXIS")] = None,
-    columns: Annotated[str, arg(metavar="AXIS")] = "method",
-    value: Metric = "rt_le_m",
-    where: Chosen = (),
 ) -> None:
-    """Print the tables of a study, or with --rows any other table of its results.
+    """Print the tables of a study; `coopoc.study.tables.pivot` makes others.
 
     Example: coopoc table runs/neighbours --format latex
 
@@ -121,27 +115,16 @@ def table(
         folder: folder of the study.
         format: format of the table.
         name: print only this table of the study.
-        rows: parameter in the rows of a new table.
-        columns: parameter in the columns of a new table.
-        value: metric in the cells of a new table.
-        where: use only the results with these values.
     """
     from .study.publish import tables
-    from .study.results import Results, parsed
-    from .study.tables import pivot
 
-    if rows is None:
-        print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
-        return
-    results = Results.load(folder)
-    print(pivot(results, rows, columns, value, parsed(results.frame, where)).render(format).rstrip("\n"))
+    print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
 
 
 def report(
     folders: Folders,
     /,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
-    title: Annotated[str, arg(metavar="TEXT")] = "",
 ) -> None:
     """Write a self-contained HTML page on one or several studies.
 
@@ -150,11 +133,10 @@ def report(
     Args:
         folders: folders of the studies, in the order of the page.
         out: file to write. Default: report.html in the first folder.
-        title: title of the page.
     """
     from .study.report import report as write_report
 
-    print(write_report(folders, out or Path(*folders[:1], "report.html"), title))
+    print(write_report(folders, out or Path(*folders[:1], "report.html")))
 
 
 def list_names() -> None:

@@ -6,7 +6,7 @@ A study of one's own in one file: docs/extend.md. What it finds stands in docs/f
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from math import ceil
@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
+from coopoc.learned.federation.participation import Participation
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
@@ -130,11 +132,34 @@ def fitted(p: Params) -> NoiseModel:
     return NoiseModel.fitted(replace(recordings[acting[0]], gnss=gnss, velocity=velocity), fleet)
 
 
+@dataclass(frozen=True)
+class Byzantine(Participation):
+    """Participation with Byzantine clients, which send theta + scale (theta_i - theta).
+
+    Args:
+        names: of the Byzantine clients.
+        scale: of their updates; negative reverses them.
+
+    References:
+        Blanchard et al., NeurIPS 2017, section 5; Bagdasaryan et al., How to Backdoor Federated Learning, AISTATS 2020.
+
+    >>> import torch
+    >>> Byzantine(names=("a",), scale=-2.0).answer("a", torch.ones(1), torch.tensor([2.0])).tolist()
+    [-1.0]
+    """
+
+    names: tuple[str, ...] = ()
+    scale: float = -10.0
+
+    def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
+        """Scaled if the client is Byzantine."""
+        return theta + self.scale * (weights - theta) if name in self.names else weights
+
+
 @lru_cache(maxsize=2)
 def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Any, ...]:
     """Nets of all training seeds of a method under a condition."""
     from coopoc.learned import GainNet, federate
-    from coopoc.learned.federation.participation import Byzantine, Participation
 
     p = {**dict(given), "condition": condition, "method": method}
     nets = [GainNet(int(p["in_mult"]), int(p["out_mult"]), seed=seed) for seed in range(int(p["train_seeds"]))]

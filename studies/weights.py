@@ -17,7 +17,7 @@ from coopoc.plugins import file_digest, find, from_file, in_file
 from coopoc.study.study import Params
 from coopoc.world.sensors import VelocityReading
 
-from .scene import Start, fleet, is_real, start
+from .scene import fleet, is_real, start
 
 if TYPE_CHECKING:
     from coopoc import NoiseModel, Results
@@ -172,8 +172,6 @@ def train(
     data: Annotated[str, arg(metavar="NAME_OR_PATH")] = "town10-clients",
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/weights"),
     seed: Annotated[int, arg(metavar="N")] = 0,
-    start: Start = "gnss",
-    reading: VelocityReading = "axis",
     aggregate: Annotated[str | None, arg(metavar="RULE")] = None,
     worse: bool = False,
 ) -> None:
@@ -188,16 +186,14 @@ def train(
         data: fleet of the clients or a log with its truth, a name or a path; "mylog?until=300" takes 300 s.
         out: folder of the checkpoints.
         seed: seed of noise, split, start and batches.
-        start: start of the filter in training, the first fix or the true position.
-        reading: reading of "10 % of the velocity", per axis or of the speed on every axis.
         aggregate: aggregation rule, a name or FILE.py:NAME, instead of the recipe's.
         worse: save also what errs more than a tenth more than a Kalman filter with fitted noise.
     """
     find("coopoc.recipes", recipe)  # before torch is loaded
     from coopoc.learned.train import train_all
 
-    chosen: Any = {"seeds": [seed], "starts": [start], "readings": [reading], "recipes": [recipe]}
-    made = train_all(drives(data), out, **chosen, aggregate=aggregate, worst=math.inf if worse else WORST)
+    worst = math.inf if worse else WORST
+    made = train_all(drives(data), out, seeds=[seed], recipes=[recipe], aggregate=aggregate, worst=worst)
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")
     print(f"coopoc: {len(made)} checkpoints are in {out}", file=sys.stderr)

@@ -109,10 +109,12 @@ def test_each_command_explains_itself_with_an_example(answers, name):
 
 def test_tables_on_stdout(folder):
     assert coopoc("table runs/small --format latex", cwd=folder).stdout.startswith(r"\begin{table}")
-    more = "--rows max_neighbours --value max_error_m --where method=kalman,joint --format csv"
-    done = coopoc("table runs/small", more, cwd=folder)
+    done = coopoc("table runs/small --format csv", cwd=folder)
     header, *rows = done.stdout.splitlines()
-    assert header == "Neighbours K,KF,KF low,KF high,Joint filter,Joint filter low,Joint filter high"
+    assert (
+        header
+        == "Neighbours K,GNSS,GNSS low,GNSS high,KF,KF low,KF high,Joint filter,Joint filter low,Joint filter high"
+    )
     assert len(rows) == 2
     assert done.stderr == ""
 
@@ -131,7 +133,7 @@ def test_a_reader_that_leaves_early_is_no_error(folder, format):
 
 def test_neither_an_ascii_locale_nor_a_narrow_terminal_matters(folder):
     env = ENV | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "COLUMNS": "1"}
-    for words in ("run --help", "report runs/small", "table runs/small --rows cell"):
+    for words in ("run --help", "report runs/small", "table runs/small"):
         done = ran([*COMMAND, *words.split()], cwd=folder, env=env, timeout=60)
         assert done.returncode == 0, done.stderr
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from aggregation import Byzantine
 from conftest import refused, winding
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
@@ -19,7 +20,7 @@ from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
 from coopoc.learned.federation.history import Federation, Round, ledger
-from coopoc.learned.federation.participation import Byzantine, Participation
+from coopoc.learned.federation.participation import Participation
 from coopoc.learned.federation.rules import (
     RULES,
     Krum,
@@ -327,11 +328,9 @@ def test_a_rule_holds_as_many_byzantine_clients_as_it_tolerates_and_no_more(name
     assert moved > 1e4
 
 
-def test_a_federation_says_how_many_it_tolerates_and_warns_beyond(four):
+def test_a_federation_says_how_many_it_tolerates(four):
     assert trained(four, 1, aggregate="trimmed_mean").tolerated == 1
     assert trained(four, 1).tolerated == 0
-    with pytest.warns(RuntimeWarning, match=r"2 Byzantine clients of 4: TrimmedMean\(share=0.25\) tolerates 1 a round"):
-        trained(four, 1, aggregate="trimmed_mean", participation=Byzantine(names=("a", "b")))
 
 
 def test_a_plain_function_is_a_rule():

@@ -4,6 +4,7 @@ import hashlib
 import importlib
 import sys
 from functools import partial
+from types import ModuleType
 
 import pytest
 from conftest import refused
@@ -154,6 +155,18 @@ def test_only_what_a_cell_reaches_is_in_its_name(package, name, old, new, same):
     cell = importlib.import_module("reached_package.cells").cell
     assert (code_of(cell) == before) is same
     assert (code_of(partial(cell)) == before) is same
+
+
+@pytest.mark.parametrize("text", ["['{}' for _ in p]", "k", "lambda: k", "Own"])
+def test_a_cell_without_a_file_counts_by_its_constants_and_by_what_it_names(text, monkeypatch):
+    """As in a shell."""
+    monkeypatch.setitem(sys.modules, "shell", shell := ModuleType("shell"))
+    codes = []
+    for number in (3, 5, 3):
+        lines = f"k = {number}", f"class Own:\n    f = lambda p: {number}", f"cell = lambda p: {text.format(number)}"
+        exec("\n".join(lines), vars(shell))
+        codes.append(code_of(shell.cell))
+    assert codes[0] == codes[2] != codes[1]
 
 
 FILE = """

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 from test_report import Page
 
 from coopoc.evaluate.statistics import Interval
-from coopoc.study.results import Results, parsed
+from coopoc.study.results import Results
 from coopoc.study.style import look
 from coopoc.study.tables import FORMATS, Table, pivot
 
@@ -106,13 +106,6 @@ def test_a_metric_that_a_method_does_not_have_is_no_failure(frame):
     assert table.notes == ()
     with refused("nees = no finite value"):
         results(frame).interval("nees", method="gnss", k=0)
-
-
-def test_selection_from_text(frame):
-    found = results(frame)
-    assert parsed(found.frame, ["k=0,4", "method=gnss"]) == {"k": [0, 4], "method": ["gnss"]}
-    with refused("k = 'x': must be a whole number"):
-        parsed(found.frame, ["k=x"])
 
 
 def test_parquet_holds_every_digit(frame, tmp_path):

@@ -16,7 +16,7 @@ from contextlib import suppress
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -130,10 +130,15 @@ def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:
         return
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
-    except (OSError, TypeError, SyntaxError):  # a lambda within an expression, or no file
-        code = getattr(thing, "__code__", None)
-        texts.add(f"{thing.__qualname__} {code and (code.co_code, code.co_names)}")
-        return
+    except (OSError, TypeError, SyntaxError):  # no file, as in a shell, or a lambda within an expression
+        if isinstance(thing, type):
+            yield from vars(thing).values()
+            return
+        tree = ast.Module([], [])
+        for code in _codes(thing.__code__):
+            constants = [each for each in code.co_consts if not isinstance(each, CodeType)]
+            texts.add(f"{thing.__qualname__} {code.co_code!r} {code.co_names} {constants}")
+            tree.body += [ast.Expr(ast.Name(name)) for name in (*code.co_names, *code.co_freevars)]
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node):
             node.body = node.body[1:] or [ast.Pass()]
@@ -160,6 +165,11 @@ def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:
             value = names[node.id]
             home = getattr(value, "__module__", None) or package
             yield value if within(home) else f"{home}.{getattr(value, '__qualname__', '')}"
+
+
+def _codes(code: CodeType) -> list[CodeType]:
+    """Byte code of a function, and of the functions within it."""
+    return [code, *(inner for each in code.co_consts if isinstance(each, CodeType) for inner in _codes(each))]
 
 
 def _processor() -> str:

@@ -14,7 +14,7 @@ from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, mean_interval
 from ..text import given_path, short_repr
 from . import store
-from .cell import Params, assignments, parse
+from .cell import Params
 from .manifest import read
 from .style import METHODS, OWN
 
@@ -153,20 +153,6 @@ class Results:
             if axis in frame and axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
                 mixed = ", ".join(map(str, frame[axis].unique()))
                 raise InputError(axis, mixed, "would be averaged together", f"Name {axis} in where, rows or columns.")
-
-
-def parsed(frame: pd.DataFrame, texts: Sequence[str]) -> dict[str, list[Any]]:
-    """["method=okf,kalman"] as column -> values of the column's type.
-
-    Raises:
-        InputError: an unknown column, or a value of another type.
-    """
-    chosen = {}
-    for name, text in assignments(texts).items():
-        if name not in frame:
-            raise unknown("column", name, frame.columns)
-        chosen[name] = list(parse(name, text, tuple(frame[name].dropna().iloc[:1].tolist())))
-    return chosen
 
 
 def check_metric(frame: pd.DataFrame, value: str) -> None:

@@ -2,7 +2,6 @@
 
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -63,13 +62,9 @@ class Plan:
             raise InputError("aggregate", actual, allowed, "Ask more clients, or take the median.")
 
     def tolerated(self, names: Sequence[str]) -> int:
-        """Number of Byzantine clients of a round that the rule withstands; a warning where more are simulated."""
+        """Number of Byzantine clients of a round that the rule withstands."""
         self.check(len(names))
-        most = self.rule.tolerated(self.participation.count(len(names)))
-        if 0 < most < (hostile := len({*names} & {*getattr(self.participation, "names", ())})):
-            text = f"{hostile} Byzantine clients of {len(names)}: {self.rule.name} tolerates {most} a round"
-            warnings.warn(text, RuntimeWarning, stacklevel=4)
-        return most
+        return self.rule.tolerated(self.participation.count(len(names)))
 
 
 @one_core()

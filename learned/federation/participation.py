@@ -1,4 +1,4 @@
-"""Participation: the clients that a round asks; Byzantine clients."""
+"""Participation: the clients that a round asks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,29 +41,6 @@ class Participation:
         return frozenset(sorted(names, key=lots.__getitem__)[: self.count(len(names))])
 
     def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
-        """Weights that the server receives from a client that trained `weights` (P,) from theta (P,): these weights."""
+        """Weights that the server receives from a client that trained `weights` (P,) from theta (P,): these weights,
+        unless a class of yours simulates an attack, as `examples/aggregation.py` does."""
         return weights
-
-
-@dataclass(frozen=True)
-class Byzantine(Participation):
-    """Participation with Byzantine clients, which send theta + scale (theta_i - theta).
-
-    Args:
-        names: of the Byzantine clients.
-        scale: of their updates; negative reverses them.
-
-    References:
-        Blanchard et al., NeurIPS 2017, section 5; Bagdasaryan et al., How to Backdoor Federated Learning, AISTATS 2020.
-
-    >>> import torch
-    >>> Byzantine(names=("a",), scale=-2.0).answer("a", torch.ones(1), torch.tensor([2.0])).tolist()
-    [-1.0]
-    """
-
-    names: tuple[str, ...] = ()
-    scale: float = -10.0
-
-    def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
-        """Scaled if the client is Byzantine."""
-        return theta + self.scale * (weights - theta) if name in self.names else weights
