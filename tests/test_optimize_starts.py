@@ -16,7 +16,8 @@ from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
-from coopoc.optimize.starts.graph_starts import tree, unwound, walk
+from coopoc.optimize.starts.graph_starts import tree, walk
+from coopoc.optimize.starts.windings import rewound
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from unseen_graphs import ranged_drives, world
@@ -200,7 +201,7 @@ def test_the_tree_shares_what_a_loop_does_not_close():
 
 def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
     """Errors of a ring that sum to 1.5 rad, of two thousand that sum to thousands, or to a whole turn."""
-    graph, space = ring(2000, 0.0), Space(2, has_rotation=True)
+    problem, space = from_graph(ring(2000, 0.0), start="odometry"), Space(2, has_rotation=True)
     course = 2 * np.pi * np.arange(2000) / 2000
     shaken = course + 0.5 * np.random.default_rng(0).choice([-1.0, 1.0], 2000)
     for turns, expected in (
@@ -209,7 +210,8 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
         (shaken, True),
         (0 * course, False),
     ):
-        assert unwound(graph, space.join(np.zeros((2000, 2)), exp(turns[:, None]))) is expected
+        wound = rewound(problem, space.join(np.zeros((2000, 2)), exp(turns[:, None])), 0.0)
+        assert (next(wound, None) is None) is expected
 
 
 def test_a_search_takes_few_steps_of_the_whole(monkeypatch):

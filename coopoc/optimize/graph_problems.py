@@ -26,7 +26,6 @@ from .starts.graph_starts import (
     parts,
     position_variance,
     rotation_variance,
-    unwound,
 )
 from .starts.initial import directed
 from .starts.pose_starts import graph_of
@@ -99,7 +98,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     won = Search(first)
     if start == "auto":
         starts = {name: partial(_x0, graph, poses, name) for name in contenders(graph)} | {"odometry": lambda: start_x}
-        problem, won = _raced(graph, problem, starts, partial(unwound, graph))
+        problem, won = _raced(graph, problem, starts)
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
@@ -112,7 +111,6 @@ def _raced(
     graph: Graph,
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
-    unwound: Callable[[Floats], bool],
     draws: bool = False,
 ) -> tuple[Problem, Search]:
     """The race of what a graph offers; the problem starts at chained odometry."""
@@ -123,7 +121,7 @@ def _raced(
         if len(graph.ranges):
             late["eased"] = partial(eased, start=np.asarray(problem.x0))
         late["incremental"] = lambda _: incremental_start(graph, problem)
-    return race(problem, starts, late, unwound, "incremental" if len(graph.ranges) else "", draws)
+    return race(problem, starts, late, "incremental" if len(graph.ranges) else "", draws)
 
 
 def started(problem: Problem) -> Problem:
@@ -143,7 +141,7 @@ def started(problem: Problem) -> Problem:
             name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
         }
         at = problem.replace_unchecked(x0=frozen(directed(problem, starts["odometry"]())))
-        at, won = _raced(graph, at, starts, lambda x: False, True)
+        at, won = _raced(graph, at, starts, True)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

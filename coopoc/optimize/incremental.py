@@ -192,13 +192,13 @@ class Incremental:
 
     def __getitem__(self, node: str | int) -> Floats:
         """(ambient,) iSAM2's estimate of a node, in a time that does not grow with the others."""
-        import gtsam
-
-        k, value = self._index(node), gtsam.Values()
-        turned = k in self._poses
-        name = f"{'Pose' if turned else 'Point'}{self._problem.dimension}"
-        value.insert(0, getattr(self.isam, f"calculateEstimate{name}")(k))
-        return np.asarray(estimate(self._problem.space, [turned], value)[0])
+        k, space = self._index(node), self._problem.space
+        turned, d = k in self._poses, space.dimension
+        value = getattr(self.isam, f"calculateEstimate{'Pose' if turned else 'Point'}{d}")(k)
+        if not turned:
+            return space.join(np.asarray(value))
+        matrix = value.matrix()
+        return space.join(matrix[:d, d], matrix[:d, :d])
 
     def marginal(self, node: str | int) -> Floats:
         """(dof, dof) m^2, rad^2 covariance of a node at iSAM2's linearisation, as `Solution.covariance` has it."""

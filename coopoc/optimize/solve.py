@@ -154,7 +154,7 @@ def _searched(problem: Problem, start: Floats) -> Problem:
     random starts lead lowest."""
     starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
     began = clock()
-    problem, won = race(problem, starts, {}, lambda x: False, draws=True)
+    problem, won = race(problem, starts, {}, draws=True)
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

@@ -175,7 +175,7 @@ def contest(
                 truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
             )
             moved += moves
-    return name + ", mirrored" * (moved > 0), best_x, graduation, notes
+    return name + ", moved" * (moved > 0), best_x, graduation, notes
 
 
 def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:

@@ -7,7 +7,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ...formats.graph import Graph
-from ..algebra.cholesky import cholesky_of, columns_solved
+from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked
@@ -26,8 +26,6 @@ DRIFT = 0.5
 """rad, standard deviation by which odometry may turn in a stage: beyond it a stage begins in no basin."""
 SWEEPS = 5
 """Of rotation averaging in space; in the plane the first is exact."""
-WOUND = 2.0
-"""rad by which the errors along a cycle may sum; with another turn they would sum to twice as much and more."""
 WHOLE_GROWTH = 1.5
 """Growth after which a stage moves all nodes; the others move what is new and was so one stage before, and points."""
 STAGE_STEPS = 5
@@ -165,7 +163,7 @@ def tree(graph: Graph) -> Floats:
         for root, _, _ in reversed(roots):
             still[part[root]] = root
         variance = rotation_variance(edges.covariance, graph.dimension)
-        turns = _averaging(edges.nodes, variance, still, len(rotation))
+        turns, _ = averaging(edges.nodes, variance, still, len(rotation))
         for _ in range(SWEEPS):
             step = turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))
             rotation = exp(step) @ rotation
@@ -174,9 +172,9 @@ def tree(graph: Graph) -> Floats:
     return with_points(graph, position, rotation, reached)
 
 
-def _averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> Callable[[Floats], Floats]:
+def averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> tuple[Callable[[Floats], Floats], Cholesky]:
     """Errors (M, k) of differences between pairs of nodes -> moves (n, k) of all but the `still` ones, one in each
-    part, which make the sum of squares over the variances least."""
+    part, which make the sum of squares over the variances least; and the factored Laplacian."""
     from scipy.sparse import csr_array, diags_array
 
     weight, row = 1.0 / variance, np.arange(len(nodes))
@@ -186,7 +184,7 @@ def _averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> Callable[[
     held[still] = weight.mean()  # of what may be shifted as a whole any weight holds a node where it is
     factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(held))
     assert factored is not None
-    return lambda error: -columns_solved(factored, gap.T @ (weight[:, None] * error))
+    return lambda error: -columns_solved(factored, gap.T @ (weight[:, None] * error)), factored
 
 
 def file(graph: Graph) -> Floats:
@@ -221,27 +219,6 @@ def contenders(graph: Graph) -> tuple[str, ...]:
     own = int(_own(graph).sum())
     closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
     return ("tree", "odometry", *from_file, "linear") if closed else ("odometry", *from_file, "linear")
-
-
-def unwound(graph: Graph, x: Floats) -> bool:
-    """Whether no cycle of relative rotations is wound up by a turn at x (n, ambient), as in the local minima of pose
-    graphs; False where more than rotations may hide one.
-
-    In the plane the errors sum to at most WOUND along each edge with the way back on the tree of least variance, and
-    these cycles span all; in space all errors sum to less than half a turn.
-    """
-    if len(graph.ranges) or len(graph.relative_point) or len(graph.pose_prior) > 1:
-        return False
-    edges = graph.relative_pose
-    if not len(edges):
-        return True
-    (i, j), turned = edges.nodes.T, Space(graph.dimension, has_rotation=True).rotation(x)
-    error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
-    if graph.dimension == 3:
-        return bool(np.linalg.norm(error, axis=1).sum() < np.pi)
-    tree = walk(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
-    along = log(np.swapaxes(tree, 1, 2) @ turned)  # more than half a turn of it shows as a jump on an edge
-    return bool(np.abs(along[i] + error - along[j]).max(initial=0.0) < WOUND)
 
 
 def _own(graph: Graph) -> Bools:

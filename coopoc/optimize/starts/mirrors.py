@@ -12,6 +12,7 @@ from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
 from ..model.space import nearest_rotation
 from .graph_starts import parts
+from .windings import rewound
 
 RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
@@ -28,6 +29,8 @@ DOUBTED_COST, TRIED_COST = 10.0, 100.0
 and to be tried."""
 ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
+MOVED_NODES = 1800
+"""Of the cycles together that are wound the other way round."""
 MOVE_ROUNDS = 15
 """Of moves, of which three are usual."""
 MIN_SAVING = 1e-6
@@ -236,7 +239,8 @@ def across(
         ranges = ranges_of(problem, x)
         single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
         rivals = []
-        for start in _moves(ranges, single, far):
+        turns = islice(rewound(problem, x, DOUBTED_COST), min(MAX_DESCENTS, MOVED_NODES // len(x)))
+        for start in chain(_moves(ranges, single, far), turns):
             end = descend(start)
             if (now := cost(end)) < (1.0 - MIN_SAVING) * least - 1e-9:
                 x, least, count = end, now, count + 1

@@ -15,6 +15,7 @@ from .graph_starts import parts
 from .initial import directed
 from .mirrors import RANGES, Cost, Descend, across
 from .pose_starts import joining
+from .windings import rewound
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -46,24 +47,22 @@ def race(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
-    unwound: Callable[[Floats], bool],
     grown: str = "",
     draws: bool = False,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
-    All starts are tried, and those whose costs are near the least go on. One start ends the race at once:
-    its descent is `smooth`, its cost is within its chi-square bound, and either its end is `unwound` or a second start
-    led there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to
-    the same end, the late starts are tried, one after the other. Where it was smooth, the stated noise is taken to be
-    too small, and a note of the Solution reports it. At last random starts around the end are tried, and what ranges
-    alone place is mirrored.
+    All starts are tried, and those whose costs are near the least go on. One start ends the race at once: its descent
+    is `smooth`, its cost is within its chi-square bound, and a second start led there as smoothly, or there is nothing
+    but relative poses and none is to be `rewound`. Where the cost is outside that bound, the descent was not smooth,
+    and no second start led to the same end, the late starts are tried, one after the other. Where it was smooth, the
+    stated noise is taken to be too small, and a note of the Solution reports it. At last random starts around the end
+    are tried, what ranges alone place is mirrored, and cycles are wound the other way.
 
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
         late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
-        unwound: x -> whether no other minimum of a lower cost is to be feared.
         grown: which of the late starts is tried first where no other went straight.
         draws: whether points and bodies are started from random places, too.
     """
@@ -103,7 +102,7 @@ def race(
             name, x = (name if y is x else "drawn"), y
         far = name not in straight and system.cost(x) > limit
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost, far)
-        name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
+        name, cost = name + ", moved" * (moves > 0), system.cost(x)
         costs = [*reached.values(), *(each for each, _ in ends), *[cost] * (moves > 0)]
         ends += [(each, x) for each in (*rivals, *minima) if higher(each, cost, SAME_COST)]
         notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
@@ -113,6 +112,8 @@ def race(
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     late, rough = dict(late), list[str]()
+    relative = all(f.measurement.compares_poses for f in problem.factors)
+    relative = relative and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
     for name, start in starts.items():
         end, cost = attempt(name, directed(problem, start()), FIRST_STEPS, True), tried[name][0]
         if not smooth(end):
@@ -120,7 +121,8 @@ def race(
         else:
             calm.append(cost)
             alike = sum(abs(cost - other) <= SAME_COST * cost for other in calm) > 1
-            if (cost <= limit and alike) or (cost <= NEAR_COST * limit and unwound(end.x)):
+            sure = relative and cost <= NEAR_COST * limit and next(rewound(problem, end.x, 0.0), None) is None
+            if sure or (cost <= limit and alike):
                 name, x = next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost)
                 return ended(name, x, True)
             straight |= {name} if end.converged else set()
