@@ -257,10 +257,11 @@ def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
     assert len(wide.recording.links) == 6 * len(t)
 
 
-@pytest.mark.parametrize("period", [86400, 604800, 4294967.296, 619315200])
+@pytest.mark.parametrize("period", [3600, 86400, 604800, 4294967.296, 619315200])
 def test_clocks_that_begin_anew_go_on(tmp_path, period):
-    """Seconds of the day at midnight, of the GPS week at its end, milliseconds of 32 bits, weeks of ten: the file with
-    stamps that go on is the reference. One vehicle comes after the turn, one cell per object of JSON and of CSV."""
+    """The end of summer time, seconds of the day at midnight, of the GPS week at its end, milliseconds of 32 bits,
+    weeks of ten: the file with stamps that go on is the reference. One vehicle comes after the turn, one cell per
+    object of JSON and of CSV."""
     t, rows = period - 10 + np.arange(0, 20, 0.5), []
     for now in t.tolist():
         at = {"t": now, "x": 8 * (now - period), "vx": 8.0, "vy": 0.0}
@@ -286,6 +287,13 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
     (tmp_path / "bad.jsonl").write_text('{"t": 0,\n')
     with refused(r"bad\.jsonl = .*must be a table"):
         co.read_log(tmp_path / "bad.jsonl")
+
+
+def test_two_drives_of_a_file_stay_a_day_apart(tmp_path):
+    drive = pd.DataFrame({"t": np.arange(20.0), "x": np.arange(20.0), "y": 0.0, "vx": 1.0, "vy": 0.0})
+    pd.concat([drive, drive.assign(t=drive["t"] + 86400)]).to_csv(tmp_path / "a.csv")
+    recording = co.read_log(tmp_path / "a.csv").recording
+    assert np.isfinite(recording.gnss[0, :, 0, 0]).sum() == 40
 
 
 def test_a_header_may_stand_in_one_of_several_tables(tmp_path):

@@ -139,6 +139,19 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
         assert error(course_of_fixes, method) < 1.3 * alone
 
 
+def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
+    """Beside a compass of 1 degree, on the way of a car; and what is known of no direction at the start is absent."""
+    rng, (speed, course) = np.random.default_rng(1), car()
+    speed[0], noise = 0.0, {"speed_std": 0.1 + 0 * T, "yaw_rate_std": 0.001 + 0 * T}
+    gyro = {"speed": speed, "yaw_rate": np.gradient(course, 0.1) + rng.normal(0, 0.001, len(T)), **noise}
+    known = error(log(tmp_path / "known", "car", 1.0, 10, speed=speed, heading=course)[0], co.Kalman())
+    read = log(tmp_path / "gyro", "car", 1.0, 10, **gyro)[0]
+    assert error(read, co.Kalman()) < 1.5 * known
+    coarse = co.read_log(tmp_path / "gyro", dt=0.5).recording
+    pace = np.linalg.norm(coarse.velocity[0, 1:, 0], axis=1)
+    assert np.nanmax(np.abs(pace - np.interp(coarse.t[1:], T, speed))) < 0.5
+
+
 @pytest.mark.parametrize("std", [0.05, 1.5])
 def test_the_speed_of_a_slow_robot_is_along_its_course(tmp_path, std):
     pace = np.linalg.norm(np.gradient(path("robot"), 0.1, axis=0), axis=1)

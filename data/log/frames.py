@@ -24,8 +24,9 @@ ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
 WEEK = 604800.0
-PERIODS = WEEK / 7, WEEK, 2**32 / 1000, 1024 * WEEK
-"""s, after which clocks begin anew: a day, a GPS week, 32 bits of milliseconds, and the number of a week."""
+PERIODS = 3600.0, WEEK / 7, WEEK, 2**32 / 1000, 1024 * WEEK
+"""s, after which clocks begin anew: an hour, where summer time ends, a day, a GPS week, 32 bits of milliseconds, and
+the number of a week."""
 SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
@@ -43,9 +44,8 @@ HEADING_STD = 0.05
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
     """Rows whose stamps go on where those of a vehicle begin anew after one of PERIODS; those of another file, such as
     the truth, may count on."""
-    t = rows["t"]
-    back = t < rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
-    last = rows.groupby(["file", "vehicle"], sort=False)["t"].shift()
+    t, last = rows["t"], rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
+    back = t < last
     for period in PERIODS:
         part = (t - last[(last - t).between(0.9 * period, 1.1 * period)].max()) / period + 1.0
         if part.between(-0.25, 1.25)[t.notna()].all() and not part.between(0.25, 0.75).any():
@@ -196,13 +196,13 @@ def assumed(
     if climbs > 0.0:
         noise["climb_std"] = np.sqrt(climbs / dt)
         summary.assume(f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, as fixes show: no vz was measured")
-    ratio = 0.0
-    if drifts > 0.0:
+    ratio, moving = 0.0, [member for member in members if not member.stands]
+    if moving and all(member.wander.any() for member in moving):
         floor = max(np.sqrt(drifts / dt), rare * of(*MOTION, default=base.velocity_floor, unit="m/s"))
         summary.assume(
-            f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
+            f"{floor:.2g} m/s or more as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )
-        if len(summary.shown) == sum(not member.stands for member in members):
+        if len(summary.shown) == len(moving):
             noise["velocity_reading"] = "fixes"
     elif {*MOTION}.isdisjoint(square.index):
         ratio, floor = base.velocity_std_ratio, base.velocity_floor

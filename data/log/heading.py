@@ -47,6 +47,7 @@ class Course(NamedTuple):
         at: function from times (G,) s to headings (G,) rad, NaN where unknown.
         source: what it is the course of, "" where it was measured.
         wanders: m^2/s, by which a position that is predicted with it becomes uncertain.
+        of_pace: function from times to m^2/s at 1 m/s, the same of a direction that errs: times the speed to the 4/3.
         unsure: rad, standard deviation of a heading that was derived.
         shown: (M,) s, when fixes have shown it, where nothing else turns it until they do again.
         bends: rad/m, root mean square of how it turns on the way.
@@ -55,6 +56,7 @@ class Course(NamedTuple):
     at: HeadingAt = unknown
     source: str = ""
     wanders: float = 0.0
+    of_pace: HeadingAt = np.zeros_like
     unsure: float = 0.0
     shown: Floats = np.empty(0)
     bends: float = 0.0
@@ -68,12 +70,14 @@ class Reckoning(NamedTuple):
         speed: m/s.
         yaw_rate: rad/s.
         std: m, of a fix on an axis.
+        walk: rad in a root of a second, by which the integral of the yaw rate wanders.
     """
 
     fixes: Signal
     speed: Signal
     yaw_rate: Signal
     std: float
+    walk: float = GYRO_WALK
 
     def parts(self, gap: float) -> "Iterator[Reckoning]":
         """Between gaps of the yaw rate, which nothing leads across."""
@@ -85,7 +89,7 @@ class Reckoning(NamedTuple):
                 for inside in [(signal.t >= t[0] - 0.5 * gap) & (signal.t <= t[-1] + 0.5 * gap)]
             )
             if min(len(fixes.t), len(speed.t), len(rate.t)) > 1:
-                yield Reckoning(fixes, speed, rate, self.std)
+                yield self._replace(fixes=fixes, speed=speed, yaw_rate=rate)
 
 
 def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:
@@ -149,22 +153,27 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
     def at(times: Floats) -> Floats:
         return np.where(covered(rate.t, times, gap, gap / 2), last(times), np.nan)
 
-    s, pace = float(np.sqrt(np.median(variance[known]))), float(np.median(np.abs(way.speed.value)))
-    wanders = (2.0 * (s * pace) ** 2) ** (2 / 3) * (way.std**2 * float(np.median(np.diff(way.fixes.t)))) ** (1 / 3)
-    return Course(at, "fixes", wanders, s), bool(others < MIRRORED * ours)
+    noise, square = way.std**2 * float(np.median(np.diff(way.fixes.t))), Signal(t, variance[:, None])
+
+    def of_pace(times: Floats) -> Floats:
+        rise: Floats = np.nan_to_num(4.0 * noise * held(square, times)[:, 0] ** 2) ** (1 / 3)
+        return rise
+
+    s = float(np.sqrt(np.median(variance[known])))
+    return Course(at, "fixes", of_pace=of_pace, unsure=s), bool(others < MIRRORED * ours)
 
 
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     """Times (M,) s and headings (M,) rad, NaN until one is SURE, of the pose filter whose innovations are the least
     until then, of those that begin in STARTS directions; their variances (M,) rad^2; and the least sums (2,) of squared
     innovations over their variances, with the yaw rates and with those of the other sign."""
-    fixes, speed, rate, std = way
+    fixes, speed, rate, std, walk = way
     span = max(float(rate.t[-1] - fixes.t[0]), STEP)
     dt = max(STEP, span / min(PER_SAMPLE * len(rate.t), MOST_STEPS))
     t = np.arange(fixes.t[0], fixes.t[0] + span + dt, dt)
     sensors = Sensors(
         gnss_std=(std, std, PLANE_STD),
-        yaw_rate_std=GYRO_WALK / dt**0.5,
+        yaw_rate_std=walk / dt**0.5,
         compass=False,
         speed_scale_std=SCALE,
         yaw_rate_bias_std=GYRO_BIAS,

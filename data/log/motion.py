@@ -182,6 +182,9 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still, still[:, 0])
     std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
+    gyro = float(only(rows, "yaw_rate")["std"].median() * np.median(np.diff(turn.t)) ** 0.5) if len(turn.t) > 1 else 0.0
+    if gyro > 0.0:
+        way = way._replace(walk=gyro)
     shown, (derived, mirrored) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
@@ -221,8 +224,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     else:
         moved, times, heading = _in_world(name, rows, measured, shown, derived, way, steps)
         signals, rate = [times], none
-        velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
-    there, by_fixes = _present(signals, steps), signals[0] is fixes
+        velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else moved
+    there, by_fixes = _present(signals, steps) & np.isfinite(velocity[:, 0]), signals[0] is fixes
     held = _held(fixes, np.nan_to_num(moves), there, steps, again, way.std)
     if held.any():
         own = only(rows, "x")
@@ -277,25 +280,33 @@ def climbing(fixes: Signal) -> float:
 
 def _in_world(
     name: str, rows: Rows, measured: Signal, shown: Shown, derived: Course | None, way: Reckoning, steps: Steps
-) -> tuple[Signal | None, Signal, Course]:
-    """Velocity, None where the fixes have to show it; the samples that it is of; and the heading, by `measured` ones or
-    derived."""
+) -> tuple[Floats | None, Signal, Course]:
+    """Velocity (T, 3), NaN where its direction is unknown, None where the fixes have to show it; the samples that it is
+    of; and the heading, by `measured` ones or derived."""
     summary, speed = steps.summary, way.speed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), only(rows, "speed")
     heading = _heading(measured, world, shown, derived, way, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
-        return Signal(world.t, np.nan_to_num(world.value)), world, heading._replace(wanders=0.0)
+        moved = step_means(Signal(world.t, np.nan_to_num(world.value)), steps.grid)
+        return moved, world, heading._replace(wanders=0.0, of_pace=np.zeros_like)
     if len(speed.t) and (heading.at is not unknown or abs(speed.value.mean()) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
-        pace = np.interp(at, speed.t, speed.value[:, 0])
-        angle = heading.at(at)
-        kept, own = np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading.at is unknown), np.isin(at, speed.t)
+
+        def moving(at: Floats) -> Floats:
+            """(G, 3) m/s, NaN where something moves, and no heading is known."""
+            pace, angle = np.interp(at, speed.t, speed.value[:, 0]), heading.at(at)
+            stands = np.isnan(angle) & ((np.abs(pace) < STANDS) | (heading.at is unknown))
+            return pace[:, None] * np.where(stands[:, None], 0.0, turned(AHEAD, angle))
+
+        velocity = moving(at)
+        kept, own = np.isfinite(velocity[:, 0]), np.isin(at, speed.t)
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
-        velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading
+        known = pd.DataFrame(velocity).bfill().ffill().to_numpy()
+        means = step_means(Signal(at, known), steps.grid) + 0.0 * moving(steps.grid + 0.5 * steps.dt)
+        return means, Signal(at[own & kept], at), heading
     if len(speed.t):
         raise InputError(
             f"{place(speeds)}, speed",
@@ -336,16 +347,18 @@ def _heading(
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
             bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
-            return Course(courses, source, wanders, float(np.median(std)), t[: len(t) * (rate is None)], float(bends))
+            shown_at = t[: len(t) * (rate is None)]
+            return Course(courses, source, wanders, np.zeros_like, float(np.median(std)), shown_at, float(bends))
     return Course()
 
 
 def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:
-    """(T,) m^2/s, by which a position becomes uncertain: `heading.wanders`, and where a course is held for longer than
-    fixes are apart, by d/dt of (k s^2 / 2)^2, with the bends k of the way s since then, of s^2 at most."""
-    more: Floats = np.zeros(len(moves))
+    """(T,) m^2/s, by which a position becomes uncertain: `heading.wanders`, that of its pace, and where a course is
+    held for longer than fixes are apart, by d/dt of (k s^2 / 2)^2, with the bends k of the way s since then, of s^2 at
+    most."""
+    pace = np.linalg.norm(np.nan_to_num(moves), axis=1)
+    more: Floats = heading.of_pace(steps.grid) * pace ** (4 / 3)
     if heading.wanders > 0.0 and len(heading.shown) > 1:
-        pace = np.linalg.norm(np.nan_to_num(moves), axis=1)
         way = np.cumsum(pace) * steps.dt
         last = heading.shown[np.searchsorted(heading.shown, steps.grid).clip(1) - 1] + steps.gap(heading.shown)
         s = (way - np.interp(last, steps.grid, way)).clip(0.0)
