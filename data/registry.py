@@ -4,7 +4,7 @@ import inspect
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from coopoc.world.storage import read_recording
 from .cells import TABLES
 from .fetch import bring
 from .fleet_files import read_fcd, read_table, read_tum, tum_files
-from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
 from .mrclam import MAX_GAP, read_mrclam
@@ -81,7 +80,19 @@ def _stored_log(path: Path) -> Log:
     return Log(recording, truth, Summary(path.name, grid, vehicles, {"links": len(recording.links)}), True)
 
 
-LOGS: Mapping[str, Callable[..., Log]] = {"pyfg": read_graph_log, "recording": _stored_log, "log": read_log}
+@wraps(read_log)
+def _graph_log(path: Path, **options: Any) -> Log:
+    """In body frames; a factor graph states all its noise, so that no error lasts."""
+    log = read_log(path, **{"frame": "body", "dt": 0.1, **options})
+    whole = replace(log.recording.sensors, range_offset_std=0.0, speed_scale_std=0.0, yaw_rate_bias_std=0.0)
+    return replace(log, recording=replace(log.recording, sensors=whole))
+
+
+LOGS: Mapping[str, Callable[..., Log]] = {
+    "pyfg": _graph_log,
+    "recording": _stored_log,
+    "log": read_log,
+}
 """Formats of real measurements -> reader; one of several files or endings belongs to `log.read.READERS`."""
 DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "table": read_table,

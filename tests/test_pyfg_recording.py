@@ -27,25 +27,27 @@ def tiers():
 def test_odometry_and_ranges_are_those_of_the_file(tiers):
     """Counts of the raw text, and the truth of its vertices: ranges err by their stated 0.04 m."""
     seen, fleet = tiers.recording, tiers.truth
-    assert fleet.ids == ("A", "B", "C", "D", "L0")
-    assert seen.landmarks == (4,)
+    assert fleet.ids == ("L0", "A", "B", "C", "D")
+    assert seen.landmarks == (0,)
+    fleet = replace(fleet, position=np.where(np.arange(5)[:, None] == 0, seen.gnss[0], fleet.position))
     assert 0.9 * 7789 < len(seen.links) <= 7789  # several of a pair in a step are one
     gap = fleet.position[seen.links.step, seen.links.neighbour] - fleet.position[seen.links.step, seen.links.observer]
     error = seen.relative[0, :, 0] - np.linalg.norm(gap, axis=1)
-    assert np.median(np.abs(error)) < 0.04
+    assert np.nanmedian(np.abs(error)) < 0.04
     assert seen.sensors.range_std == pytest.approx(0.04, abs=0.005)
     assert seen.sensors.velocity_std_ratio == 0
     motion, rate = body_motion(fleet)
-    assert np.corrcoef(seen.velocity[0, 1:, :4, 0].ravel(), motion[1:, :4, 0].ravel())[0, 1] > 0.75
-    assert np.corrcoef(seen.body.yaw_rate[0, 1:, :4].ravel(), rate[1:, :4].ravel())[0, 1] > 0.5
+    for ours, true, least in ((seen.velocity[0, ..., 0], motion[..., 0], 0.75), (seen.body.yaw_rate[0], rate, 0.5)):
+        there = np.isfinite(ours + true)[:, 1:] & (np.arange(len(true)) > 0)[:, None]
+        assert np.corrcoef(ours[:, 1:][there], true[:, 1:][there])[0, 1] > least
 
 
 def test_the_command_says_what_was_read(tmp_path, capsys):
     data_check(str(measured("tiers.pyfg")), picture=tmp_path / "tiers.png")
     said = capsys.readouterr().out
-    assert "read: 7092 ranges" in said
-    assert "innovations against a filter of each vehicle alone, throughout, from the truth's first poses" in said
-    assert re.search("(?m)^check: 9% of what was logged is not used, first of all 697 edges outside the steps", said)
+    assert "read: 7074 ranges" in said
+    assert "where all are there, from the truth's first poses" in said
+    assert re.search("(?m)^check: D: its yaw rates are too large by 0.011", said)
 
 
 def test_graphs_that_are_no_recording_are_named(tmp_path):
@@ -57,18 +59,19 @@ def test_graphs_that_are_no_recording_are_named(tmp_path):
     seen, fleet = log.recording, log.truth
     assert np.allclose(seen.velocity[0, 1:, 0], [10.0, 0.0, 0.0])
     assert len(seen.links) == 0
-    assert fleet.position[-1, 0, 0] == pytest.approx(29.0)
-    assert co.read_log(file).recording.ids == ("A",)
+    assert fleet.position[-1, 0, 0] == pytest.approx(28.0, abs=1.0)
+    assert co.read_log(file, frame="body").recording.ids == ("A",)
     file.write_text("\n".join(lines + edges[:9] + edges[10:]) + "\n")
     with refused("no odometry from A9 to A10"):
         load_log(file)
-    with refused("share two steps"):
-        load_log(file, dt=5.0)
+    file.write_text("\n".join(lines + edges) + "\n")
+    with refused("must be well below"):
+        load_log(file, dt=9.0)
 
 
 def test_points_and_poses_of_others_are_counted():
     log = load_log(measured("mrclam6.pyfg"))
-    assert log.summary.refused["measured points and poses of other robots"][0] == 13121
+    assert log.summary.refused["points and poses that were measured, but odometry"][0] == 13121
 
 
 def without_stamps(part: Any) -> Any:

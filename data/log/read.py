@@ -31,6 +31,7 @@ from ..assemble import (
 from ..bag import is_topic, read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
+from ..graphs import read_pyfg_rows
 from ..librsf import is_librsf, read_librsf
 from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
@@ -57,6 +58,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
     ".txt": read_librsf,
     ".pt": read_nclt,
+    ".pyfg": read_pyfg_rows,
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore, stamps, ...) -> its rows. A new format is one more
 entry."""
