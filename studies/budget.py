@@ -80,7 +80,13 @@ def _figure(results: Results) -> "Plot | None":
 
 
 def choices(results: Results) -> "pd.DataFrame":
-    """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel."""
+    """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel.
+
+    >>> import pandas as pd
+    >>> from coopoc.study.results import Results
+    >>> len(choices(Results("budget", "?", (), {}, pd.DataFrame({"method": ["okf"]}), pd.DataFrame(), 0, {})))
+    0
+    """
     rows, names = results.frame, [*AXES, "method", "noise_model"]
     if not {*names, PAYLOAD} <= set(rows):
         return rows.iloc[:0]

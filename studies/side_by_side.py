@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from coopoc.study.numbers import Results, present, ran, rms
+from coopoc.study.numbers import Results, alike, present, ran, rms
 from coopoc.study.style import look
 from coopoc.study.tables import Table, smooths
 
@@ -70,7 +70,8 @@ def _figure(results: Results) -> "Plot | None":
 
 
 def _findings(results: Results) -> dict[str, str]:
-    """The best filter at each K, the largest first; smoothers know later measurements and are no filters."""
+    """The best filter at each K, the largest first, and those alike; smoothers know later measurements and are no
+    filters."""
     texts, rows = {}, results.frame
     for k in sorted(rows["max_neighbours"].unique(), reverse=True) if len(rows) else ():
         pairs = rows[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
@@ -78,10 +79,15 @@ def _findings(results: Results) -> dict[str, str]:
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
         ranked = sorted((v, (m, n)) for (m, n), v in each.items() if m != "bound" and not smooths([look(m).label]))
         if ranked:
-            value, (method, model) = ranked[0]
+            (value, (method, model)), *others = ranked
+            best = of(method, model, max_neighbours=k)
+            same = [
+                look(m).label for _, (m, n) in others if alike(results, best, of(m, n, max_neighbours=k), "rt_le_m")
+            ]
+            near = f" Noise may explain the difference from {', '.join(dict.fromkeys(same))}." * bool(same)
             gap = f", {value / bound:.2f} times the bound" if bound else ""
             named = f" ({model})" if len({model for _, model in each} - {"bound"}) > 1 else ""
-            texts[f"K = {k}"] = f"K = {k}: {look(method).label}{named} has the lowest rms, {value:.3g} m{gap}."
+            texts[f"K = {k}"] = f"K = {k}: {look(method).label}{named} has the lowest rms, {value:.3g} m{gap}.{near}"
     return texts
 
 

@@ -154,6 +154,12 @@ def test_a_bag_is_read(tmp_path, ros):
     assert any("/car0/note" in what for what in log.summary.unused)
     assert float(co.rt_le(co.Kalman()(rec, [0]), log.truth)[0, 0]) < 0.05
     assert np.isfinite(co.read_log(path, dt=0.1).recording.gnss[0, :, :, 0]).sum() == 80 * 2
+    file = path if ros == 1 else next(path.glob("*.db3"))
+    whole = file.read_bytes()
+    for at in np.random.default_rng(0).integers(len(whole), size=8):
+        file.write_bytes(whole[:at] + b"\xff" * 8 + whole[at + 8 :])
+        with suppress(co.InputError):
+            read_log(path)
 
 
 def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):

@@ -22,7 +22,8 @@ TWO = {"egos": "2", "runs": 2}
 @pytest.mark.slow
 def test_side_by_side_takes_any_methods_and_conditions(tmp_path, short_town):
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
-    results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,bound"})
+    results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,kalman,bound"})
+    assert "Noise may explain the difference from" in published(tmp_path / "side_by_side")["findings"]["K = 0"]
     caption = (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
     assert "With latency_s 0.2, common_share 0.5." in caption
     mild = run_study(

@@ -52,7 +52,12 @@ def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Ce
 
 
 def attempt(function: Function, cell: Cell) -> Outcome:
-    """Compute one cell on one thread; an exception becomes its reason."""
+    """Compute one cell on one thread; an exception becomes its reason.
+
+    >>> done = attempt(lambda p: [{"x": 1}], Cell({}, {}, "a"))
+    >>> done.reason, 0.0 <= done.seconds < 60.0
+    ('', True)
+    """
     start, rows, reason, trace = time.perf_counter(), None, "", ""
     try:
         with threadpool_limits(limits=1):

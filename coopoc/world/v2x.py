@@ -66,6 +66,10 @@ class V2X:
         Sources: sizes and intervals of VW's and Renault's traces (Molina-Masegosa et al., IEEE TVT 2020, arXiv
         2004.06919); loss within 30 m in LTE-V2X at 200 to 300 vehicles per km (Gonzalez-Martin et al., IEEE TVT 2019,
         arXiv 1807.06508). A CAM carries position and velocity in the plane, so a fix and a velocity are mostly there.
+
+        >>> cam = V2X.cam()
+        >>> cam.rate, cam.latency, cam.loss, cam.burst, cam.overhead
+        (2.2, 0.02, 0.02, 5.0, 350)
         """
         return cls(max_neighbours, rate=2.2, latency=0.02, loss=0.02, burst=5.0, overhead=350)
 

@@ -109,7 +109,11 @@ class PoseFilter:
 
     @property
     def cooperative(self) -> bool:
-        """Whether other vehicles take part."""
+        """Whether other vehicles take part.
+
+        >>> PoseFilter("solo").cooperative, PoseFilter("fleet").cooperative
+        (False, True)
+        """
         return self.unit != "solo"
 
     @property
