@@ -6,6 +6,7 @@ import sys
 from functools import partial
 from types import ModuleType
 
+import numpy as np
 import pytest
 from conftest import refused
 
@@ -17,7 +18,7 @@ from coopoc.study.tables import Table, pivot
 
 
 def study(**changes: object) -> Study:
-    options = {"grid": {"k": (0, 1), "method": ("a", "b")}, "settings": {"runs": 3, "egos": (0, 1), "ratio": 0.1}}
+    options = {"grid": {"k": np.arange(2), "method": ("a", "b")}, "settings": {"runs": 3, "egos": (0, 1), "ratio": 0.1}}
     return Study(**{"name": "s", "question": "?", "cell": dict, **options, **changes})  # type: ignore[arg-type]
 
 
@@ -38,6 +39,8 @@ def test_a_list_of_cells_is_taken_as_it_stands():
     assert [c.params["method"] for c in listed.override({"k": "0"}).cells()] == ["b"]
     with refused(r"k = 7: must be among \[1, 0\]"):
         listed.override({"k": 7})
+    with refused("grid = 1: must be"):
+        study(grid=[1])
 
 
 def test_all_that_changes_the_numbers_changes_the_name_and_nothing_else_does():

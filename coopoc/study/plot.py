@@ -8,8 +8,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -37,7 +37,7 @@ class Plot:
 
     def save(self, path: str | Path) -> str:
         """Write path.pdf, path.png and path.svg, and return the caption."""
-        with mpl.rc_context(RC):
+        with style.context(["default", RC]):
             self.figure.draw_without_rendering()
             self.figure.set_layout_engine("none")
             for axes in self.figure.axes:  # the layout solver leaves the last digits of their places open
@@ -50,7 +50,7 @@ class Plot:
     def _repr_png_(self) -> bytes:
         """Image for a notebook."""
         buffer = BytesIO()
-        with mpl.rc_context(RC):
+        with style.context(["default", RC]):
             self.figure.savefig(buffer, format="png")
         return buffer.getvalue()
 
@@ -66,7 +66,7 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
         height: inches.
         grid: options of `Figure.subplots`.
     """
-    with mpl.rc_context(RC):
+    with style.context(["default", RC]):
         figure = Figure(figsize=(width, height))
         yield figure, figure.subplots(rows, columns, **grid)
 

@@ -96,7 +96,7 @@ class Results:
         for name, wanted in {**(where or {}), **also}.items():
             if name not in frame:
                 raise unknown("column", name, frame.columns)
-            values = list(wanted) if isinstance(wanted, list | tuple | set) else [wanted]
+            values = list(wanted) if pd.api.types.is_list_like(wanted) else [wanted]
             for value in values:
                 if not _is(self.frame[name], value).any():
                     there = ", ".join(map(str, self.frame[name].unique()[:12])) or "(no cell has finished)"

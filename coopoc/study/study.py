@@ -10,7 +10,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ..arrays import listed
+import numpy as np
+
+from ..arrays import listed, named
 from ..errors import InputError, unknown
 from ..plugins import file_digest, find, from_file, in_file
 from ..text import file_name
@@ -104,8 +106,10 @@ class Study:
     def values(self) -> dict[str, list[Scalar]]:
         """Values of each axis."""
         if isinstance(self.grid, Mapping):
-            return {name: listed(name, values, "Give a tuple of values.") for name, values in self.grid.items()}
-        names = dict.fromkeys(name for params in self.grid for name in params)
+            given = {name: listed(name, values, "Give a tuple of values.") for name, values in self.grid.items()}
+            return {k: [v.item() if isinstance(v, np.generic) else v for v in values] for k, values in given.items()}
+        hint = "Give {name: values}, or a list of {name: value}."
+        names = dict.fromkeys(name for p in listed("grid", self.grid, hint) for name in named("grid", p, hint))
         return {name: list(dict.fromkeys(p[name] for p in self.grid if name in p)) for name in names}
 
     def cells(self) -> list[Cell]:
@@ -214,7 +218,7 @@ def points(study: Study) -> list[Mapping[str, Scalar]]:
     """Parameters of each cell, in the order of the grid."""
     grid = study.grid
     if isinstance(grid, Mapping):
-        grid = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+        grid = [dict(zip(grid, values, strict=True)) for values in itertools.product(*study.values().values())]
     return [p for p in grid if study.where({**study.settings, **p})]
 
 
