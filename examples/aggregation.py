@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from coopoc.study.plot import Plot
     from coopoc.study.results import Results
 
-RULES = ("mean", "uniform", "median", "trimmed_mean", "krum", "multi_krum")
+RULES = ("mean", "median", "trimmed_mean", "krum", "multi_krum")
 BESIDE = ("centralised", "kalman")
 """Methods beside the rules under `iid` and `heterogeneous`."""
 METHODS = (*RULES, *BESIDE, "bound")
@@ -61,10 +61,7 @@ OF_THE_TEST = ("condition", "method", "scenario", "velocity_ratio", "runs", "ego
 
 
 def meaningful(p: Params) -> bool:
-    """Every rule under every condition in which enough clients take part; other methods where they are compared.
-
-    `uniform` is `mean` where all clients have as many pieces.
-    """
+    """Every rule under every condition in which enough clients take part; other methods where they are compared."""
     from coopoc.learned.federation.rules import rule
 
     condition, method = str(p["condition"]), str(p["method"])
@@ -74,7 +71,7 @@ def meaningful(p: Params) -> bool:
         return condition == "iid"
     asked = int(p["members"]) // (2 if condition == "half absent" else 1)
     enough: bool = rule(method).least <= asked
-    return enough and (method != "uniform" or condition == "heterogeneous")
+    return enough
 
 
 def members(p: Params) -> Fleet:

@@ -4,9 +4,7 @@ import importlib
 import os
 import pickle
 import sys
-import time
 from io import StringIO
-from threading import Thread
 
 import pytest
 from shell import python
@@ -14,7 +12,6 @@ from tqdm import tqdm
 
 from coopoc import workers
 from coopoc.kernels.compiling import compile, machine_code
-from coopoc.kernels.compiling.waiting import clock, waiting
 
 pytest.importorskip("numba")
 
@@ -79,17 +76,6 @@ def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch):
         compile._say(compile._line(compile.compiled))
         assert bar.start_t == began + 5.0
     assert said.getvalue() == "compiling the compile kernel, once per machine\n"
-
-
-def test_no_clock_stands_still_while_another_thread_loads():
-    @waiting("load")
-    def wait():
-        time.sleep(0.05)
-
-    began, other = clock(), Thread(target=wait)
-    other.start()
-    other.join()
-    assert clock() - began > 0.04
 
 
 def test_a_bar_fills_no_log_with_carriage_returns(capsys):

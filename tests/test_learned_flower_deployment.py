@@ -123,11 +123,13 @@ def test_the_script_survives_the_death_of_a_node(tmp_path, mark):
 def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path, mark):
     """Flower has no strategy for the rule: the ServerApp raises, and the exit status is not zero."""
     write_table(winding(100, 4.0, 4.0), tmp_path / "one.parquet")
-    command = script(tmp_path / "site", "--data", tmp_path / "one.parquet", "--change", f"aggregate=uniform {CHANGE}")
+    command = script(
+        tmp_path / "site", "--data", tmp_path / "one.parquet", "--change", f"aggregate=multi_krum {CHANGE}"
+    )
     done = ran(command, timeout=600)
     assert done.returncode != 0
     assert "the run failed" in done.stderr
-    assert "aggregate = 'uniform'" in (tmp_path / "site" / "run.log").read_text()
+    assert "aggregate = 'multi_krum'" in (tmp_path / "site" / "run.log").read_text()
 
 
 def test_the_script_stops_everything_on_ctrl_c(tmp_path, mark):

@@ -92,6 +92,8 @@ def code_of(function: Callable[..., Any]) -> str:
     20
     >>> code_of(textwrap.dedent) == code_of(textwrap.fill)  # of Python itself nothing counts
     True
+    >>> code_of(eval("lambda: 2")) == code_of(eval("lambda: 3"))  # no file, as in a shell
+    False
     """
     texts: set[str] = set()
     _reach(function, texts, [])

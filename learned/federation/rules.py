@@ -78,15 +78,6 @@ def mean(weights: Tensor, sizes: Tensor) -> Tensor:
     return (share[:, None] * weights).sum(0)
 
 
-def uniform(weights: Tensor, sizes: Tensor) -> Tensor:
-    """sum_i theta_i / C, whatever the sizes.
-
-    >>> uniform(torch.tensor([[1.0], [3.0]]), torch.tensor([3.0, 1.0])).tolist()
-    [2.0]
-    """
-    return mean(weights, torch.ones_like(sizes))
-
-
 def median(weights: Tensor, sizes: Tensor | None = None) -> Tensor:
     """Median of each weight over the clients (C, P), the mean of the middle two where C is even; sizes are not read.
 
@@ -199,7 +190,6 @@ class Krum(Rule):
 
 RULES: Mapping[str, Rule] = {
     "mean": Function(mean),
-    "uniform": Function(uniform),
     "median": Function(median),
     "trimmed_mean": TrimmedMean(),
     "krum": Krum(),

@@ -17,7 +17,14 @@ spent = _Spent()
 
 
 def clock() -> float:
-    """s of a clock that stands still while this thread loads or compiles."""
+    """s of a clock that stands still while this thread loads or compiles, and goes on while another does.
+
+    >>> from threading import Thread
+    >>> from time import sleep
+    >>> began, other = clock(), Thread(target=waiting("load")(sleep), args=(0.05,))
+    >>> other.start(), other.join(), clock() - began > 0.04
+    (None, None, True)
+    """
     return perf_counter() - spent.load - spent.compile
 
 
