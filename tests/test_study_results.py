@@ -108,14 +108,6 @@ def test_a_metric_that_a_method_does_not_have_is_no_failure(frame):
         results(frame).interval("nees", method="gnss", k=0)
 
 
-def test_parquet_holds_every_digit(frame, tmp_path):
-    frame = frame.assign(quantiles=[[0.1, 0.2]] * len(frame))
-    results(frame).to_parquet(tmp_path / "r.parquet")
-    back = pd.read_parquet(tmp_path / "r.parquet")
-    assert_array_equal(back["rt_le_m"], frame["rt_le_m"])
-    assert back["quantiles"].iloc[0].tolist() == [0.1, 0.2]
-
-
 def test_tables_over_several_columns(frame):
     frame = frame.query("method == 'kalman'")
     table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m")

@@ -39,7 +39,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         progress: show a bar on stderr.
     """
     folder = given_path(folder)
-    results.to_parquet(folder / "results.parquet")
+    store.write(folder / "results.parquet", lambda file: results.frame.to_parquet(file, index=False))
     missing, errors = dict[str, str](), list[Exception]()
 
     def made(name: str, view: Callable[[Results], Any]) -> Any:

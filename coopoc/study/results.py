@@ -143,10 +143,6 @@ class Results:
             rows.append([*names, each.mean, each.low, each.high, each.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
-    def to_parquet(self, path: str | Path) -> None:
-        """Write all rows as Parquet."""
-        store.write(given_path(path), lambda file: self.frame.to_parquet(file, index=False))
-
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
         check_metric(frame, value)
         for axis in self.axes:
