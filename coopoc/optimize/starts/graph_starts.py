@@ -1,6 +1,7 @@
 """Starts of a graph: chained odometry, a spanning tree, points by trilateration, and one that grows with the drive."""
 
 from collections.abc import Callable, Iterable
+from itertools import combinations
 
 import numpy as np
 
@@ -32,8 +33,8 @@ STAGE_STEPS = 5
 """Of each stage."""
 STAGE_TOLERANCE = 1e-2
 """m or rad, a step at which a stage has arrived for the purpose."""
-COINCIDENT = 1e-9
-"""m, a gap below which has no direction."""
+CUT_SPHERES = 12
+"""Of the ranges of a point, whose spheres are cut."""
 HOLDING = 2
 """Ranges per dimension from which a point is placed by them."""
 
@@ -101,41 +102,40 @@ def loose_firsts(part: Ints, nodes: Ints, held: Ints) -> Ints:
     return loose[np.unique(part[loose], return_index=True)[1]]
 
 
-def trilaterate(places: Floats, ranges: Floats) -> Floats:
-    """(d,) minimum of sum (|l - p_k| - r_k)^2, the lowest of those that three guesses lead to.
+def crossings(places: Floats, ranges: Floats) -> Floats:
+    """(C, d) points where d of the spheres of `ranges` (K,) around `places` (K, d) meet, or come nearest to it; of many
+    some are cut that are spread over all.
 
-    2 p_k . l - |l|^2 = |p_k|^2 - r_k^2 is linear in l and |l|^2. Where the places nearly lie in a plane (on a line),
-    how far l is from it follows from the ranges, and on which side from the descents.
+    >>> crossings(np.array([[0.0, 0], [8, 0]]), np.array([5.0, 5])).round(6)
+    array([[ 4., -3.],
+           [ 4.,  3.]])
+    """
+    d, few = places.shape[1], np.unique(np.linspace(0, len(places) - 1, CUT_SPHERES).round().astype(np.int64))
+    chosen = np.array([*combinations(few, d)])
+    p, r = places[chosen], ranges[chosen]
+    gap = p[:, 1:] - p[:, :1]
+    right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
+    foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
+    height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
+    up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
+    return np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d)
+
+
+def trilaterate(places: Floats, ranges: Floats) -> Floats:
+    """(d,) where spheres cross and all ranges fit best; of less than d spheres any point of one.
 
     Args:
-        places: (K, d) m; with K <= d one of the points that the ranges allow is returned.
+        places: (K, d) m.
         ranges: (K,) m.
 
     >>> trilaterate(np.array([[0.0, 0], [8, 0], [4, 1]]), np.array([5.0, 5, 2])).round(6)
     array([4., 3.])
     """
-    from scipy.optimize import least_squares
-
-    d, middle = places.shape[1], places.mean(axis=0)
-    p = places - middle
-    if len(p) <= d:
-        return np.asarray(places[0] + ranges[0] * np.eye(d)[0])
-    matrix = np.concatenate([2.0 * p, np.ones((len(p), 1))], axis=1)
-    guess = np.linalg.lstsq(matrix, np.square(p).sum(axis=1) - ranges**2, rcond=None)[0][:d]
-    normal = np.linalg.eigh(p.T @ p)[1][:, 0]
-    flat = guess - normal * (guess @ normal)
-    height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
-
-    def off(at: Floats) -> Floats:
-        return np.asarray(np.linalg.norm(at - p, axis=1) - ranges)
-
-    def directions(at: Floats) -> Floats:
-        gap = at - p
-        return np.asarray(gap / np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), COINCIDENT))
-
-    guesses = guess, flat + height * normal, flat - height * normal
-    ends = [least_squares(off, at, directions, method="lm") for at in guesses]
-    return np.asarray(min(ends, key=lambda end: end.cost).x + middle)
+    if len(places) < places.shape[1]:
+        return np.asarray(places[0] + ranges[0] * np.eye(places.shape[1])[0])
+    met = crossings(places, ranges)
+    off = np.linalg.norm(met[:, None] - places, axis=2) - ranges
+    return np.asarray(met[np.square(off).sum(axis=1).argmin()])
 
 
 def chained(graph: Graph) -> Floats:

@@ -11,7 +11,7 @@ from ..assess.assess import squared
 from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
 from ..model.space import nearest_rotation
-from .graph_starts import parts
+from .graph_starts import crossings, parts
 from .windings import rewound
 
 RANGES = "range", "range_offset"
@@ -20,8 +20,6 @@ LEVEL = "bearing", "azimuth"
 """Kinds whose measurements of a node in space fit its mirror image at a level plane as well."""
 PATH_NODES = 2000
 """Nodes up to which all shortest paths are taken."""
-CUT_SPHERES = 12
-"""Of the ranges of a point, whose spheres are cut."""
 MAX_DESCENTS = 32
 """Moves that are followed by descents, of few bodies and the most promising first."""
 DOUBTED_COST, TRIED_COST = 10.0, 100.0
@@ -31,6 +29,8 @@ ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
 MOVED_NODES = 1800
 """Of the cycles together that are wound the other way round."""
+LEVEL_TIE = 1e-9
+"""m^2, by which a level plane wins."""
 MOVE_ROUNDS = 15
 """Of moves, of which three are usual."""
 MIN_SAVING = 1e-6
@@ -140,30 +140,12 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     return found
 
 
-def crossings(places: Floats, ranges: Floats) -> Floats:
-    """(C, d) points where d of the spheres of `ranges` (K,) around `places` (K, d) meet, or come nearest to it; of many
-    some are cut that are spread over all.
-
-    >>> crossings(np.array([[0.0, 0], [8, 0]]), np.array([5.0, 5])).round(6)
-    array([[ 4., -3.],
-           [ 4.,  3.]])
-    """
-    d, few = places.shape[1], np.unique(np.linspace(0, len(places) - 1, CUT_SPHERES).round().astype(np.int64))
-    chosen = np.array([*combinations(few, d)])
-    p, r = places[chosen], ranges[chosen]
-    gap = p[:, 1:] - p[:, :1]
-    right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
-    foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
-    height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
-    up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
-    return np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d)
-
-
 def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
     """Nodes (K, ambient) moved as a rigid body as near as possible to their image at the best-fit plane of places
-    (K, d), keeping their handedness."""
+    (K, d), a level one where several fit, keeping their handedness."""
     space, middle = problem.space, places.mean(axis=0)
-    at, normal = space.position(nodes), np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
+    gaps, at = places - middle, space.position(nodes)
+    normal = np.linalg.eigh(gaps.T @ gaps + LEVEL_TIE * np.diag(np.arange(space.dimension) < 2))[1][:, 0]
     image = at - 2.0 * np.outer((at - middle) @ normal, normal)
     turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
     moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
@@ -181,7 +163,7 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
     """Other places of a body: it is reflected at the best-fit plane of what ranges it, and a point is put where its
     spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image."""
     space, x, (rows, own, other) = ranges.problem.space, ranges.x, _outward(ranges, body)
-    if len(rows) < 2:
+    if len(rows) < 2 and not (len(rows) and space.dimension == 3):
         return []
     at, places, index = space.position(x[body]), space.position(x[other]), np.searchsorted(body, own)
     least = ELSEWHERE_SHARE * ranges.distance[rows].mean()
@@ -218,10 +200,9 @@ def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
 
 def across(
     problem: Problem, x: Floats, descend: Descend, cost: Cost, far: bool = False
-) -> tuple[Floats, int, list[float], list[Ints]]:
-    """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
-    moves led down, the costs of the other ends, and the bodies that ranges or level directions hardly
-    distinguish from elsewhere.
+) -> tuple[Floats, int, list[tuple[float, Floats]]]:
+    """The lowest end (n, ambient) of descents from x, from mirror images of what ranges alone place and from cycles
+    that are wound the other way, how many moves led down, and the other ends with their costs.
 
     Args:
         problem: whose ranges, and their losses, place the bodies.
@@ -230,29 +211,22 @@ def across(
         cost: of a point.
         far: whether moves are tried that add much to the cost before the others have given way.
     """
-    ranges, loose, least, count = ranges_of(problem, x), bodies(problem, x), cost(x), 0
-    every = loose
-    if len(loose) == len(problem.names) or not len(ranges.nodes):  # nothing to mirror at
+    loose, least, count, ends = bodies(problem, x), cost(x), 0, list[tuple[float, Floats]]()
+    if len(loose) == len(problem.names) or not any(f.kind in RANGES for f in problem.factors):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
-    rivals, single = list[float](), list[Move]()
     while count < MOVE_ROUNDS:
-        ranges = ranges_of(problem, x)
+        ranges, ends = ranges_of(problem, x), []
         single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
-        rivals = []
         turns = islice(rewound(problem, x, DOUBTED_COST), min(MAX_DESCENTS, MOVED_NODES // len(x)))
         for start in chain(_moves(ranges, single, far), turns):
             end = descend(start)
             if (now := cost(end)) < (1.0 - MIN_SAVING) * least - 1e-9:
                 x, least, count = end, now, count + 1
                 break
-            rivals.append(now)
+            ends.append((now, end))
         else:
             break
-    doubtful = {int(body[0]): body for adds, _, body in single if adds <= DOUBTED_COST}
-    if problem.dimension == 3 and any(f.kind in LEVEL for f in problem.factors):
-        moved = {int(body[0]) for *_, body in single}
-        doubtful |= {int(body[0]): body for body in every if body[0] not in moved}
-    return x, count, rivals, [*doubtful.values()]
+    return x, count, ends
 
 
 def movable(problem: Problem) -> Ints:

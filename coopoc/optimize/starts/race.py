@@ -101,14 +101,12 @@ def race(
             y, ends = drawn(scattered(problem, x), x, landed, system.cost, quiet)
             name, x = (name if y is x else "drawn"), y
         far = name not in straight and system.cost(x) > limit
-        x, moves, rivals, doubtful = across(problem, x, descend, system.cost, far)
+        x, moves, others = across(problem, x, descend, system.cost, far)
         name, cost = name + ", moved" * (moves > 0), system.cost(x)
         costs = [*reached.values(), *(each for each, _ in ends), *[cost] * (moves > 0)]
-        ends += [(each, x) for each in (*rivals, *minima) if higher(each, cost, SAME_COST)]
+        others += [(each, x) for each in minima]
+        ends += [end for end in others if higher(end[0], cost, SAME_COST) or not higher(end[0], cost)]
         notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
-        if doubtful and not notes:
-            names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
-            notes = (f"the measurements fit other places of {names} nearly as well: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     late, rough = dict(late), list[str]()
