@@ -88,9 +88,7 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
 def test_a_race_ends_as_low_as_the_best_of_all_starts(seed):
     """Odometry that turns by 0.6 rad a step: some starts, of 13 and 20 all but the truth, wind cycles up."""
     graph = random_graph(seed, robots=1, steps=40, landmarks=0, ranges=0, seen=0, loops=4, turn_std=0.6)
-    costs = [
-        solve(from_graph(graph, start=start), throw=False).cost for start in ("odometry", "file", "linear", "tree")
-    ]
+    costs = [solve(from_graph(graph, start=start), throw=False).cost for start in ("odometry", "file", "tree")]
     assert max(costs) > 1.01 * min(costs)
     lost = replace(graph, position=np.full_like(graph.position, np.nan))
     assert solve(from_graph(lost)).cost <= min(costs) * (1 + 1e-9)

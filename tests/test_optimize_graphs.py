@@ -76,11 +76,11 @@ def without_noise(seed: int, dimension: int) -> Graph:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_linear_solves_find_the_truth_whatever_the_odometry_was(dimension):
+def test_averages_find_the_truth_whatever_the_odometry_was(dimension):
     graph = replace(without_noise(201, dimension), relative_point=PointEdges())
     truth = Space(dimension, has_rotation=True).join(graph.position, graph.rotation)
     poses = np.flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
-    found = from_graph(graph, start="linear").x0
+    found = from_graph(graph, start="tree").x0
     assert found[poses] == pytest.approx(truth[poses], abs=1e-3)
 
 
@@ -91,7 +91,7 @@ def test_the_automatic_start_undoes_bad_odometry(dimension, seed):
     graph = random_graph(seed, dimension, steps=150, turn_std=0.1, loops=80, seen=120)
     found = solve(from_graph(graph))
     assert found.status is Status.SOLVED
-    assert found.extras["start"] in ("odometry", "tree", "linear")
+    assert not found.extras["start"].startswith("file")
     assert found.cost <= solve(from_graph(graph, start="file")).cost * (1 + 1e-9)
 
 

@@ -19,7 +19,6 @@ from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import (
     STARTS,
-    chained,
     contenders,
     incremental_start,
     loose_firsts,
@@ -39,7 +38,7 @@ MEASUREMENT_KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
-Start = Literal["odometry", "file", "tree", "linear", "incremental", "auto"]
+Start = Literal["odometry", "file", "tree", "incremental", "auto"]
 
 
 def read_graph(
@@ -66,10 +65,10 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         graph: of `coopoc.formats.load_graph`.
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
             file; "file" takes the vertices as they are, which in PyFG are the truth; "tree" follows loop closures and
-            measurements between robots, too; "linear" relaxes rotations (`convex/chordal.py`); "incremental" solves the
-            first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries all that the graph
-            offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where
-            the first pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
+            measurements between robots, too, and averages them; "incremental" solves the first poses of all robots,
+            then more with them (`starts/graph_starts.py`); "auto" tries all that the graph offers and keeps the one
+            that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first pose that
+            measures them sees them, or by ranges. The Solution names the start in extras["start"].
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
@@ -160,12 +159,7 @@ def _counted(notes: Sequence[str]) -> list[str]:
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
     """(n, ambient) of a start that needs no search."""
-    x0 = STARTS.get(name, chained)(graph)
-    if name == "linear" and poses:
-        from .convex.chordal import chordal_start  # convex solves, and solve starts here
-
-        factors = _factors(graph, "chordal")
-        x0 = chordal_start(Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses))
+    x0 = STARTS[name](graph)
     return x0 if poses else x0[:, : graph.dimension]
 
 

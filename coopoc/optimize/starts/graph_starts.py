@@ -1,6 +1,6 @@
 """Starts of a graph: chained odometry, a spanning tree, points by trilateration, and one that grows with the drive."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -146,7 +146,8 @@ def chained(graph: Graph) -> Floats:
 
 def tree(graph: Graph) -> Floats:
     """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
-    between robots too, their rotations then averaged; what it does not join hangs on as in `chained`.
+    between robots too, their rotations then averaged, and with these all positions; what it does not join hangs on as
+    in `chained`.
 
     With turns w_k of R_k in the world and e = log(R_j R_ij^T R_i^T) sum |e + w_j - w_i|^2 / var is least where a
     Laplacian of the graph, which is factored once, times w is the divergence of e.
@@ -155,34 +156,40 @@ def tree(graph: Graph) -> Floats:
         Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
         and accurate approximation for planar pose graph optimization, IJRR 2014.
     """
-    edges, roots = graph.relative_pose, _roots(graph)
+    edges, roots, d = graph.relative_pose, _roots(graph), graph.dimension
     position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
-    (i, j), part = edges.nodes.T, parts(len(rotation), edges.nodes)
-    if len(edges) >= reached.sum() - part.max():
-        still = np.unique(part, return_index=True)[1]
-        for root, _, _ in reversed(roots):
-            still[part[root]] = root
-        variance = rotation_variance(edges.covariance, graph.dimension)
-        turns, _ = averaging(edges.nodes, variance, still, len(rotation))
+    (i, j), held = edges.nodes.T, [root for root, _, _ in roots]
+    if len(edges) >= reached.sum() - parts(len(rotation), edges.nodes).max():
+        turns, _ = averaging(edges.nodes, rotation_variance(edges.covariance, d), len(rotation), held)
         for _ in range(SWEEPS):
             step = turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))
             rotation = exp(step) @ rotation
             if np.abs(step).max(initial=0.0) <= STAGE_TOLERANCE:
                 break
-    return with_points(graph, position, rotation, reached)
+    space, seen = Space(d, has_rotation=True), (edges, graph.relative_point)
+    at = space.position(with_points(graph, position, rotation, reached))
+    (i, j), moved = np.concatenate([each.nodes for each in seen]).T, np.concatenate([each.position for each in seen])
+    variance = np.concatenate([position_variance(each.covariance, d) for each in seen])
+    places, _ = averaging(np.stack([i, j], axis=1), variance, len(at), held)
+    return space.join(at + places(at[j] - at[i] - (rotation[i] @ moved[..., None])[..., 0]), rotation)
 
 
-def averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> tuple[Callable[[Floats], Floats], Cholesky]:
-    """Errors (M, k) of differences between pairs of nodes -> moves (n, k) of all but the `still` ones, one in each
-    part, which make the sum of squares over the variances least; and the factored Laplacian."""
+def averaging(
+    nodes: Ints, variance: Floats, n: int, held: Sequence[int] = ()
+) -> tuple[Callable[[Floats], Floats], Cholesky]:
+    """Errors (M, k) of differences between pairs of nodes -> moves (n, k) which make the sum of squares over the
+    variances least; and the factored Laplacian. Of each part the first that is `held`, or else its first, stays."""
     from scipy.sparse import csr_array, diags_array
 
-    weight, row = 1.0 / variance, np.arange(len(nodes))
+    weight, row, part = 1.0 / variance, np.arange(len(nodes)), parts(n, nodes)
     sign = np.repeat([-1.0, 1.0], len(nodes))
     gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
-    held = np.zeros(n)
-    held[still] = weight.mean()  # of what may be shifted as a whole any weight holds a node where it is
-    factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(held))
+    still = np.unique(part, return_index=True)[1]
+    for node in reversed(held):
+        still[part[node]] = node
+    pinned = np.zeros(n)
+    pinned[still] = weight.mean()  # of what may be shifted as a whole any weight holds a node where it is
+    factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(pinned))
     assert factored is not None
     return lambda error: -columns_solved(factored, gap.T @ (weight[:, None] * error)), factored
 
@@ -216,9 +223,7 @@ def contenders(graph: Graph) -> tuple[str, ...]:
     moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
     if loops <= moved - 1:
         return ("odometry", *from_file)
-    own = int(_own(graph).sum())
-    closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
-    return ("tree", "odometry", *from_file, "linear") if closed else ("odometry", *from_file, "linear")
+    return ("tree", "odometry", *from_file)
 
 
 def _own(graph: Graph) -> Bools:

@@ -7,7 +7,7 @@ import numpy as np
 from ...arrays import Floats
 from ..model.problem import Problem
 from ..model.space import exp, log
-from .graph_starts import averaging, parts, position_variance, rotation_variance
+from .graph_starts import averaging, position_variance, rotation_variance
 from .pose_starts import graph_of
 
 BRIDGE = 1e-9
@@ -37,14 +37,13 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     if not len(edges):
         return
     (i, j), turned, at = edges.nodes.T, space.rotation(x), space.position(x)
-    still = np.unique(parts(n, edges.nodes), return_index=True)[1]
     weight = 1.0 / rotation_variance(edges.covariance, space.dimension)[:, None]
     error = weight * log(turned[j] @ np.swapaxes(turned[i] @ edges.rotation, 1, 2)) * np.sign(j - i)[:, None]
     pairs, of = np.unique(np.sort(edges.nodes, axis=1), axis=0, return_inverse=True)
     sums = np.zeros((len(pairs), 1 + space.angles))
     np.add.at(sums, of.ravel(), np.hstack([weight, error]))
     error, v = sums[:, 1:] / sums[:, :1], 1.0 / sums[:, 0]
-    turns, factored = averaging(pairs, v, still, n)
+    turns, factored = averaging(pairs, v, n)
     a, b = pairs.T
     move = turns(error)
     left = error + move[b] - move[a]
@@ -55,7 +54,7 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     value, first = np.unique(adds.round(6), return_index=True)  # the same of all along a cycle
     chosen = first[value <= most].tolist()
     if chosen:
-        places, _ = averaging(edges.nodes, position_variance(edges.covariance, space.dimension), still, n)
+        places, _ = averaging(edges.nodes, position_variance(edges.covariance, space.dimension), n)
     for k in chosen:
         bent = error.copy()
         bent[k] -= 2.0 * np.pi * left[k] / max(size[k], BRIDGE)
