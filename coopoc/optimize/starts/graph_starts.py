@@ -13,7 +13,7 @@ from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked
 from ..model.problem import Problem
-from ..model.space import Space, carried, exp, log
+from ..model.space import Space, carried, nearest_rotation
 
 Roots = Iterable[tuple[int, Floats, Floats]]
 """(pose, position, rotation) in the order in which the walk may start from them."""
@@ -25,8 +25,10 @@ MOST_STAGES = 200
 """Whatever the odometry."""
 DRIFT = 0.5
 """rad, standard deviation by which odometry may turn in a stage: beyond it a stage begins in no basin."""
-SWEEPS = 5
-"""Of rotation averaging in space; in the plane the first is exact."""
+SWEEPS = 10
+"""Solves with the rotations of the one before; the matrix is factored once."""
+PROXIMAL = 1e-4
+"""Weight of the last rotations beside that of a median relative rotation: it acts over a hundred poses of a chain."""
 WHOLE_GROWTH = 1.5
 """Growth after which a stage moves all nodes; the others move what is new and was so one stage before, and points."""
 STAGE_STEPS = 5
@@ -146,26 +148,13 @@ def chained(graph: Graph) -> Floats:
 
 def tree(graph: Graph) -> Floats:
     """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
-    between robots too, their rotations then averaged, and with these all positions; what it does not join hangs on as
-    in `chained`.
-
-    With turns w_k of R_k in the world and e = log(R_j R_ij^T R_i^T) sum |e + w_j - w_i|^2 / var is least where a
-    Laplacian of the graph, which is factored once, times w is the divergence of e.
-
-    References:
-        Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
-        and accurate approximation for planar pose graph optimization, IJRR 2014.
-    """
+    between robots too, their rotations then `relaxed`, and with these all positions averaged; what it does not join
+    hangs on as in `chained`."""
     edges, roots, d = graph.relative_pose, _roots(graph), graph.dimension
     position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
-    (i, j), held = edges.nodes.T, [root for root, _, _ in roots]
+    held = [root for root, _, _ in roots]
     if len(edges) >= reached.sum() - parts(len(rotation), edges.nodes).max():
-        turns, _ = averaging(edges.nodes, rotation_variance(edges.covariance, d), len(rotation), held)
-        for _ in range(SWEEPS):
-            step = turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))
-            rotation = exp(step) @ rotation
-            if np.abs(step).max(initial=0.0) <= STAGE_TOLERANCE:
-                break
+        rotation = relaxed(graph, rotation, held)
     space, seen = Space(d, has_rotation=True), (edges, graph.relative_point)
     at = space.position(with_points(graph, position, rotation, reached))
     (i, j), moved = np.concatenate([each.nodes for each in seen]).T, np.concatenate([each.position for each in seen])
@@ -174,21 +163,64 @@ def tree(graph: Graph) -> Floats:
     return space.join(at + places(at[j] - at[i] - (rotation[i] @ moved[..., None])[..., 0]), rotation)
 
 
+def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
+    """(n, d, d) minimum over any matrices of sum |R_j - R_i R_ij|_F^2 / var + |R_i - P_i|_F^2 / far, P those before,
+    which are then projected to rotations, SWEEPS times; of each part the first that is `held` is as it was.
+
+    Without the last term matrices shrink to zero along a chain, and what is left of them turns at random; with it each
+    sweep is a step of a projected inverse power iteration.
+
+    References:
+        Carlone, Tron, Daniilidis, Dellaert, Initialization techniques for 3D SLAM, ICRA 2015 (chordal relaxation);
+        Boumal, Nonconvex phase synchronization, SIAM J. Optim. 2016 (generalized power method).
+    """
+    from scipy.sparse import bsr_array, eye_array
+
+    edges, (n, d, _) = graph.relative_pose, rotation.shape
+    weight = 1.0 / np.sqrt(rotation_variance(edges.covariance, d))
+    back, ones = -np.swapaxes(edges.rotation, 1, 2), np.broadcast_to(np.eye(d), edges.rotation.shape)
+    blocks = weight[:, None, None, None] * np.stack([back, ones], axis=1)
+    gaps = bsr_array(
+        (blocks.reshape(-1, d, d), edges.nodes.ravel(), 2 * np.arange(len(edges) + 1)), shape=(len(edges) * d, n * d)
+    )
+    far = PROXIMAL * np.median(weight) ** 2
+    factored, turned = cholesky_of(gaps.T @ gaps + far * eye_array(n * d)), rotation
+    assert factored is not None
+    for _ in range(SWEEPS):
+        matrices = columns_solved(factored, far * np.swapaxes(turned, 1, 2).reshape(n * d, d)).reshape(n, d, d)
+        turned = nearest_rotation(np.swapaxes(matrices, 1, 2))
+    part = parts(n, edges.nodes)
+    still = firsts(part, held)[part]
+    return rotation[still] @ np.swapaxes(turned[still], 1, 2) @ turned
+
+
+def firsts(part: Ints, held: Sequence[int]) -> Ints:
+    """Of each part of all nodes (n,) the first that is `held`, or else its first."""
+    still = np.unique(part, return_index=True)[1]
+    for node in reversed(held):
+        still[part[node]] = node
+    return still
+
+
 def averaging(
     nodes: Ints, variance: Floats, n: int, held: Sequence[int] = ()
 ) -> tuple[Callable[[Floats], Floats], Cholesky]:
     """Errors (M, k) of differences between pairs of nodes -> moves (n, k) which make the sum of squares over the
-    variances least; and the factored Laplacian. Of each part the first that is `held`, or else its first, stays."""
+    variances least; and the factored Laplacian. Of each part one of the `firsts` stays.
+
+    References:
+        Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
+        and accurate approximation for planar pose graph optimization, IJRR 2014.
+    """
     from scipy.sparse import csr_array, diags_array
 
-    weight, row, part = 1.0 / variance, np.arange(len(nodes)), parts(n, nodes)
+    weight, row = 1.0 / variance, np.arange(len(nodes))
     sign = np.repeat([-1.0, 1.0], len(nodes))
     gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
-    still = np.unique(part, return_index=True)[1]
-    for node in reversed(held):
-        still[part[node]] = node
     pinned = np.zeros(n)
-    pinned[still] = weight.mean()  # of what may be shifted as a whole any weight holds a node where it is
+    pinned[firsts(parts(n, nodes), held)] = (
+        weight.mean()
+    )  # of what may be shifted as a whole any weight holds a node where it is
     factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(pinned))
     assert factored is not None
     return lambda error: -columns_solved(factored, gap.T @ (weight[:, None] * error)), factored
