@@ -153,7 +153,7 @@ def tree(graph: Graph) -> Floats:
     edges, roots, d = graph.relative_pose, _roots(graph), graph.dimension
     position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
     held = [root for root, _, _ in roots]
-    if len(edges) >= reached.sum() - parts(len(rotation), edges.nodes).max():
+    if len(edges):
         rotation = relaxed(graph, rotation, held)
     space, seen = Space(d, has_rotation=True), (edges, graph.relative_point)
     at = space.position(with_points(graph, position, rotation, reached))
@@ -185,8 +185,9 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
     )
     far = PROXIMAL * np.median(weight) ** 2
     factored, turned = cholesky_of(gaps.T @ gaps + far * eye_array(n * d)), rotation
-    assert factored is not None
     for _ in range(SWEEPS):
+        if factored is None:
+            return rotation
         matrices = columns_solved(factored, far * np.swapaxes(turned, 1, 2).reshape(n * d, d)).reshape(n, d, d)
         turned = nearest_rotation(np.swapaxes(matrices, 1, 2))
     part = parts(n, edges.nodes)
@@ -204,9 +205,10 @@ def firsts(part: Ints, held: Sequence[int]) -> Ints:
 
 def averaging(
     nodes: Ints, variance: Floats, n: int, held: Sequence[int] = ()
-) -> tuple[Callable[[Floats], Floats], Cholesky]:
+) -> tuple[Callable[[Floats], Floats], Cholesky | None]:
     """Errors (M, k) of differences between pairs of nodes -> moves (n, k) which make the sum of squares over the
-    variances least; and the factored Laplacian. Of each part one of the `firsts` stays.
+    variances least; and the factored Laplacian, None and no moves where rounding makes it indefinite. Of each part one
+    of the `firsts` stays.
 
     References:
         Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
@@ -217,13 +219,16 @@ def averaging(
     weight, row = 1.0 / variance, np.arange(len(nodes))
     sign = np.repeat([-1.0, 1.0], len(nodes))
     gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
-    pinned = np.zeros(n)
-    pinned[firsts(parts(n, nodes), held)] = (
-        weight.mean()
-    )  # of what may be shifted as a whole any weight holds a node where it is
+    pinned = np.zeros(n)  # of what may be shifted as a whole any weight holds a node where it is
+    pinned[firsts(parts(n, nodes), held)] = weight.max(initial=1e-300)
     factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(pinned))
-    assert factored is not None
-    return lambda error: -columns_solved(factored, gap.T @ (weight[:, None] * error)), factored
+
+    def moves(error: Floats) -> Floats:
+        if factored is None:
+            return np.zeros((n, error.shape[1]))
+        return -columns_solved(factored, gap.T @ (weight[:, None] * error))
+
+    return moves, factored
 
 
 def file(graph: Graph) -> Floats:

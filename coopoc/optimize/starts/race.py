@@ -67,8 +67,8 @@ def race(
         draws: whether points and bodies are started from random places, too.
     """
     system, taken, arrived = sparse(problem), 0, True
-    tried, reached, straight = dict[str, tuple[float, Floats]](), dict[str, float](), set[str]()
-    calm, minima = list[float](), list[float]()
+    tried, straight, late = dict[str, tuple[float, Floats]](), set[str](), dict(late)
+    rough, calm, minima = list[str](), list[float](), list[float]()
     mean, variance = expected(problem, system.size)
     usual = EXCESS_STDS * np.sqrt(variance)
     limit = mean + usual
@@ -83,8 +83,14 @@ def race(
         nonlocal taken
         end = arrive(system, x, steps, RACE_TOLERANCE, smooth=smooth)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
-        reached[name] = tried[name][0]
         return end
+
+    def follow(name: str, x: Floats) -> Floats:
+        nonlocal taken
+        y, steps = late.pop(name)(problem.replace_unchecked(x0=frozen(x)))
+        y, taken = descend(y), taken + steps
+        tried[name] = system.cost(y), y
+        return y
 
     def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
@@ -103,13 +109,12 @@ def race(
         far = name not in straight and system.cost(x) > limit
         x, moves, others = across(problem, x, descend, system.cost, far)
         name, cost = name + ", moved" * (moves > 0), system.cost(x)
-        costs = [*reached.values(), *(each for each, _ in ends), *[cost] * (moves > 0)]
+        costs = [each for each, _ in (*tried.values(), *ends)] + [cost] * (moves > 0)
         others += [(each, x) for each in minima]
         ends += [end for end in others if higher(end[0], cost, SAME_COST) or not higher(end[0], cost)]
         notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
-    late, rough = dict(late), list[str]()
     relative = all(f.measurement.compares_poses for f in problem.factors)
     relative = relative and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
     for name, start in starts.items():
@@ -125,30 +130,26 @@ def race(
                 return ended(name, x, True)
             straight |= {name} if end.converged else set()
     if grown in late and not straight and min(cost for cost, _ in tried.values()) > NEAR_COST * limit:
-        y, steps = late.pop(grown)(problem)
-        y, taken = descend(y), taken + steps
-        tried[grown], reached[grown] = (system.cost(y), y), system.cost(y)
+        y = follow(grown, np.asarray(problem.x0))
         if explained(y):
             return ended(grown, y)
     for name in rough:
         attempt(name, tried[name][1], FIRST_STEPS)
-    least = min(reached.values())
+    least = min(cost for cost, _ in tried.values())
     close = {name: x for name, (cost, x) in tried.items() if cost <= NEAR_COST * least}
     if max(tried[name][0] for name in close) > (1.0 + SAME_COST) * least:
         ends = [attempt(name, x, LATER_STEPS) for name, x in close.items()]
-        minima = [reached[name] for name, end in zip(close, ends, strict=True) if end.converged]
-        least = min(reached.values())
-    name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME_COST) * least)
-    if name not in straight and not explained(x) and sum(c <= (1.0 + SAME_COST) * least for c in reached.values()) == 1:
+        minima = [tried[name][0] for name, end in zip(close, ends, strict=True) if end.converged]
+        least = min(cost for cost, _ in tried.values())
+    name, *others = (name for name, (cost, _) in tried.items() if cost <= (1.0 + SAME_COST) * least)
+    x = tried[name][1]
+    if name not in straight and not explained(x) and not others:
         x = descend(x)
-        for other, made in late.items():
+        for other in [*late]:
             if explained(x):
                 break
-            y, steps = made(problem.replace_unchecked(x0=frozen(x)))
-            taken += steps
-            y = descend(y)
-            reached[other] = system.cost(y)
-            name, x = (other, y) if reached[other] < (1.0 - SAME_COST) * system.cost(x) else (name, x)
+            y = follow(other, x)
+            name, x = (other, y) if tried[other][0] < (1.0 - SAME_COST) * system.cost(x) else (name, x)
     return ended(name, x)
 
 

@@ -44,6 +44,8 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     np.add.at(sums, of.ravel(), np.hstack([weight, error]))
     error, v = sums[:, 1:] / sums[:, :1], 1.0 / sums[:, 0]
     turns, factored = averaging(pairs, v, n)
+    if factored is None:
+        return
     a, b = pairs.T
     move = turns(error)
     left = error + move[b] - move[a]
