@@ -202,9 +202,6 @@ def test_the_ledger_counts_every_byte(four):
 
 
 def test_poisoned_updates(four):
-    """A turned update is the mirror image of the honest one."""
-    honest, byzantine = trained(four[:1], 1), trained(four[:1], 1, participation=Byzantine(names=("a",), scale=-1.0))
-    torch.testing.assert_close(byzantine.history[1].weights - 0.3, 0.3 - honest.history[1].weights)
     hurt = trained(four, 6, participation=Byzantine(names=("a",), scale=-20.0))
     kept = trained(four, 6, participation=Byzantine(names=("a",), scale=-20.0), aggregate="median")
     assert not hurt.history[-1].rejected
