@@ -179,6 +179,21 @@ def find(group: str, name: str) -> Any:
     raise _unknown(group, name)
 
 
+def called(group: str, name: str, hint: str, *arguments: Any) -> Any:
+    """What the object of a name returns; InputError if it cannot be called with the arguments.
+
+    >>> called("coopoc.channels", "bsm", "Give the number of neighbours.", 4).rate
+    10.0
+    """
+    found = find(group, name)
+    try:
+        return found(*arguments)
+    except InputError:
+        raise
+    except Exception as error:  # of code that is not ours
+        raise InputError(GROUPS[group], repr(name), f"cannot be called: {error}", hint) from error
+
+
 def _load(point: metadata.EntryPoint, name: str) -> Any:
     try:
         return point.load()

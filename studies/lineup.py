@@ -10,7 +10,7 @@ import numpy as np
 from coopoc import InputError, Study
 from coopoc.arrays import Floats, one_of, refuse
 from coopoc.errors import unknown
-from coopoc.plugins import find, in_file, names
+from coopoc.plugins import called, find, in_file, names
 from coopoc.study.study import Params, Row
 from coopoc.study.style import NOT_CAUSAL
 from coopoc.text import given_path
@@ -123,10 +123,7 @@ def own(name: str, noise: "NoiseModel | str" = "nominal") -> Any:
     from coopoc import Message, Method
 
     shows = "docs/extend.md shows one; its first argument is noise_model."
-    try:
-        method = find("coopoc.methods", name)(noise)
-    except Exception as error:  # of a class that is not ours
-        raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", shows) from error
+    method = called("coopoc.methods", name, shows, noise)
     if not (isinstance(method, Method) and isinstance(method.name, str) and isinstance(method.message, Message)):
         raise InputError(
             "method",

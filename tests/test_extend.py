@@ -239,7 +239,7 @@ def test_what_is_not_there_is_named(tmp_path):
     (tmp_path / "own.py").write_text(
         "half = ''.index\nALPHA = 1\nclass Mute:\n    def __init__(self, noise):\n        pass\n"
     )
-    for name, message in (("Mute", "must have a name"), ("half", "cannot be made from a noise model")):
+    for name, message in (("Mute", "must have a name"), ("half", "cannot be called")):
         with refused(message):
             own(f"{tmp_path}/own.py:{name}")
     with refused(r"is a int, no Study"):

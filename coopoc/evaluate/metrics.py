@@ -9,7 +9,7 @@ from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
 from ..kernels.covariances import normalised
 from ..methods.track import UNSOUND, Track, of_recording
-from ..plugins import find
+from ..plugins import called
 from ..world.body_frames import true_heading, turned
 from ..world.fleet import Fleet
 from ..world.links import wrap
@@ -205,7 +205,8 @@ def measure(name: str, track: Track, fleet: Fleet) -> Floats:
     >>> measure("rt_le_m", GNSS()(observe(fleet, Sensors(), runs=5)), fleet).shape
     (5, 1)
     """
-    return checked(name, find("coopoc.metrics", name)(track, fleet), "(R, E)", (len(track.x), len(track.egos)))
+    scores = called("coopoc.metrics", name, "Give a function of a Track and a Fleet.", track, fleet)
+    return checked(name, scores, "(R, E)", (len(track.x), len(track.egos)))
 
 
 def fix_innovations(track: Track, recording: Recording) -> Floats:

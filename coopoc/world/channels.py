@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError
-from ..plugins import find
+from ..plugins import called
 from .v2x import V2X
 
 
@@ -54,9 +54,8 @@ def channel(name: str, max_neighbours: int = 6) -> V2X:
     >>> channel("bsm", 4).rate
     10.0
     """
-    result = find("coopoc.channels", name)(max_neighbours)
+    hint = "Give a function of the number of neighbours that returns V2X(max_neighbours, ...)."
+    result = called("coopoc.channels", name, hint, max_neighbours)
     if not isinstance(result, V2X):
-        raise InputError(
-            "channel", name, f"returned {type(result).__name__}, no V2X", "Return V2X(max_neighbours, ...)."
-        )
+        raise InputError("channel", name, f"returned {type(result).__name__}, no V2X", hint)
     return result
