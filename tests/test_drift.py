@@ -107,9 +107,10 @@ def test_what_cannot_be_is_refused():
         posterior_bound(fleet, OWN, 0, smoothing=True)
 
 
-@pytest.mark.parametrize("most", [0, 3])
-def test_errors_that_last_and_are_not_told_are_in_the_covariance(most):
-    """Law: NEES is about 10, not 260 as without them; where noise is white it is near its 2.4."""
+@pytest.mark.parametrize(("most", "limit"), [(0, 25.0), (3, 5.0)])
+def test_errors_that_last_and_are_not_told_are_in_the_covariance(most, limit):
+    """Law: NEES is about 10, not 260 as without them, and 2.2 where neighbours show how far receivers err (9.3); where
+    noise is white it is near its 2.4."""
     fleet, egos, levels, drawn = load_fleet("town10").between(0, 500), [24, 30], [], []
     for drift in (0.0, 3.0):
         acting = replace(WHITE, gnss_drift_std=drift, gnss_drift_time=40.0)
@@ -119,7 +120,7 @@ def test_errors_that_last_and_are_not_told_are_in_the_covariance(most):
         levels.append((float(np.median(nees(track, fleet)[:, 200:])), track.covariance[:, 200:, :, 0, 0].mean()))
     assert 1.5 < levels[0][0] < 2.6
     assert levels[0][1] < 0.1
-    assert levels[1][0] < 25.0
+    assert levels[1][0] < limit
     assert levels[1][1] > 10 * levels[0][1]
     late = replace(seen, gnss=np.where((np.arange(500) < 200)[:, None, None], drawn[0].gnss, seen.gnss))
     shown = CooperativeFilter()(late, egos).covariance

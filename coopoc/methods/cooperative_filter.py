@@ -133,7 +133,7 @@ class CooperativeFilter(Checked):
 
     - *Trust*: the fixes of a vehicle that is new have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
       $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
-      retrospect. A mean innovation that has become unlikely revokes the trust; in the
+      retrospect. A mean innovation that has become unlikely, beside those of others, revokes the trust; in the
       ego's own receiver, too, where there are neighbours, unless these put it where its fix is: then it goes there.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
       exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$; that of a component far beyond

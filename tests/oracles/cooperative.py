@@ -231,7 +231,7 @@ class Oracle:
         )
         return SimpleNamespace(
             **{name: {} for name in tables},
-            **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight", "unsaid"), 0.0),
+            **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight", "unsaid", "whole"), 0.0),
             **{name: np.zeros(6) for name in ("level", "learned", "information")},
             **{name: np.zeros(3) for name in ("gap", "cov", "course", "recent")},
             **dict.fromkeys(("left", "unused")),
@@ -260,7 +260,7 @@ class Oracle:
             self.remember_error(t)
             x, cov = self.compare(t, *self.answer())
             cov = cov * (1 + self.state.unsaid / self.state.whole)
-            more, white = max(self.lasting(t) - np.trace(cov), 0.0), self.r[t, self.ego] * self.white
+            more, white = max(self.lasting(t) - np.trace(cov), self.others()), self.r[t, self.ego] * self.white
             here = x, cov + more * np.diag(white / white.sum())
             b, way = self.state.belief, self.state.way
             at = [b.x[b.at("x", j)] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
@@ -287,6 +287,9 @@ class Oracle:
         n = max(w.sum(), 1.0)
         c, error = w @ p / n, w @ p**2 / n * max(2 / np.clip(seconds, 1, 100), 1 / n)
         return float(max(c - error / c, 0.0)) if c > 0 else 0.0
+
+    def others(self) -> float:
+        return 3 * self.usual() / (1 + self.trusted()) if self.priors.forget else 0.0
 
     def answer(self) -> tuple[Floats, Floats]:
         """Position and covariance, averaged over which errors are there."""
@@ -492,6 +495,7 @@ class Oracle:
                 corrections = louder * self.grown if self.corrected_now else 0.0
                 grown, way = max(q.sum() - 3 * corrections, 0.0), self.by[t] * dt if self.corrected_now else 0.0
             s.left = s.left[0] - way, s.left[1] + grown / 3
+        s.unsaid *= min(self.own_variance() / s.whole, 1.0) if s.whole else 1.0
         s.whole = self.own_variance()
         for j in [j for j in others if j not in s.members]:
             self.join(t, j)
@@ -655,18 +659,34 @@ class Oracle:
     def wrong_on_average(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
         s, g = self.state, self.priors
-        count, mean = s.mean.get(j, (0.0, np.zeros(3)))
+        count, mean, noise = s.mean.get(j, (0.0, np.zeros(3), 0.0))
         count = min(count + 1, WINDOW)
-        s.mean[j] = count, mean
+        s.mean[j] = count, mean, noise
         if j not in s.trusted and q > max(g.fix_gate, FIX_GATE):
             return True
         mean = mean + (gap * min(1.0, sqrt(CLIP / q)) - mean) / count
-        s.mean[j] = count, mean
+        s.mean[j] = count, mean, noise + (r.sum() - noise) / count
         v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
-        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
         near = mean @ np.linalg.solve(v, mean)
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
+        v = v + (self.usual(j) if j != self.ego else 0.0) * np.eye(3)
+        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
         return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
+
+    def usual(self, but=-1) -> float:
+        """Variance of an error of fixes that nothing is wrong with: of those of the others the lower median distance
+        from the nearest."""
+        s, b, errors = self.state, self.state.belief, list[Any]()
+        for j in (self.ego, *(j for j in s.members if j in s.last)):
+            if j != but and j not in s.trusted:
+                errors.append((b.x[b.at("b", j)], np.trace(b.p[b.at("b", j), b.at("b", j)])))
+            elif j != but and j in s.mean and s.mean[j][0] >= 3:
+                errors.append((s.mean[j][1], s.mean[j][2] / s.mean[j][0]))
+        if len(errors) < 3:
+            return 0.0
+        apart = np.array([[((x - y) ** 2).sum() - p - q for y, q in errors] for x, p in errors])
+        np.fill_diagonal(apart, inf)
+        return float(np.sort(apart.min(axis=1))[(len(errors) - 1) // 2].clip(0) / 3)
 
     def doubt(self, j, tau=TAU):
         """Its fixes have an error of that deviation, m, or none."""
@@ -1032,29 +1052,27 @@ class Oracle:
 
     def trust(self):
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
-        s, own = self.state, self.life.own
-        b, wide = s.belief, TAU**2 + own
-        narrow = 1 / (1 / own - 1 / wide) if own else 1e-6
+        s, wide = self.state, TAU**2 + self.life.own
+        b = s.belief
         while True:
-            odds = {}
+            odds, narrow = {}, {}
             for j in (self.ego, *s.members):
                 if j in s.trusted or (j not in s.last and j != self.ego):
                     continue
                 at = b.at("b", j)
                 x, p = b.x[at], b.p[at, at]
                 odds[j] = log((1 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * s.revoked.get(j, 0)
-                if own:
-                    odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * log(2 * pi * wide / own * narrow)
-                else:
-                    odds[j] += normal(x, p) - normal(0 * x, TAU**2 * np.eye(3))
+                own = min(self.life.own + self.usual(j), wide / 2)
+                narrow[j] = own * wide / (wide - own)
+                odds[j] += normal(x, narrow[j] * np.eye(3) + p) - normal(0 * x, wide * wide / (wide - own) * np.eye(3))
             best = max(odds, key=lambda j: (odds[j], -s.slot[j]), default=-1)
             if best < 0 or odds[best] <= TRUST_LOG_ODDS:
                 return
             s.trusted.add(best)
             s.mean.pop(best, None)
             for c in range(3):
-                b.update(b.row({("b", best): 1.0}, c), 0.0, narrow)
-            if not own:
+                b.update(b.row({("b", best): 1.0}, c), 0.0, max(narrow[best], 1e-6))
+            if not self.life.own:
                 b.drop(("b", best))
 
 

@@ -29,6 +29,7 @@ from .cooperative_state import (
     MEAN,
     MESSAGES,
     NO_POSITION,
+    NOISE,
     ODOMETER,
     OUT,
     PACE,
@@ -76,6 +77,7 @@ from .gaussian import (
     update,
     widen,
 )
+from .lasting import usual_error
 from .messages import block_at, three_of, vector_at
 from .otherwise import LOUDEST_NOISE, drive, learn_fix, score, turned
 
@@ -307,43 +309,46 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     for c in range(3):
         status[MEAN + c] += (clip * h.three[GAP + c] - status[MEAN + c]) / count
     mean, (p, q, r) = vector_at(status, MEAN // 3), vector_at(h.three, VARIANCE // 3)
+    status[NOISE] += (p + q + r - status[NOISE]) / count
     more = 1.0 if model.own > 0.0 else 0.0
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE)
     near, narrow = distance(s, mean)
     if count < 3.0 or near < 2.0 * (odds + REVOKE_LOG_ODDS):
         return False
-    tau2 = TAU**2
+    usual, tau2 = usual_error(f, k) if k > 0 else 0.0, TAU**2  # of the ego's all others tell
+    s = add_diagonal(s, (usual, usual, usual))
+    near, narrow = distance(s, mean)
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
     return odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE_LOG_ODDS
 
 
 @part
 def trust(f: Filter, model: Model) -> None:
-    """Set the error of fixes to zero, or to what drifts, while that is likelier than any other: the surest first.
+    """Set the error of fixes to zero, to what drifts, or to what is usual, while that is likelier than any other: the
+    surest first.
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
     g, h = f.g, f.h
-    wide, narrow, unit = TAU**2 + model.own, 0.0, TAU**2
-    if model.own > 0.0:
-        narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
-        unit = wide / model.own * narrow
+    wide, narrow = TAU**2 + model.own, 0.0
     while True:
         best, most = ABSENT, TRUST_LOG_ODDS
         for k in range(len(f.who)):
             j = f.who[k, VEHICLE]
             if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
                 continue
-            first = 3 * g.block[k, ERROR]
+            first, own = 3 * g.block[k, ERROR], min(model.own + usual_error(f, k), 0.5 * wide)
+            unit = wide * wide / (wide - own)
+            less = own / wide * unit
             for c in range(3):
                 for d in range(3):
-                    h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
+                    h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (less if c == d else 0.0)
             q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
             odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * f.status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
-                best, most = k, odds
+                best, most, narrow = k, odds, less
         if best < 0:
             return
         j = f.who[best, VEHICLE]

@@ -38,12 +38,14 @@ FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, OWN = 0, 3, 6, 9
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
-TRUSTED, COUNT, USED, MEAN, LAST, PACE, SINCE, SLIPS, REVOKED, LOUDER, STATUS = 0, 1, 2, 3, 6, 15, 21, 22, 23, 24, 28
+TRUSTED, COUNT, USED, MEAN, LAST, PACE, SINCE, SLIPS = 0, 1, 2, 3, 6, 15, 21, 22
+REVOKED, LOUDER, NOISE, STATUS = 23, 24, 25, 26
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
 that was used was sent s (-inf for none), mean innovation m, and
 SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
-motion with it m^2, when that was s (-inf for never), how many in a row were not, how often it lost trust, and by which
-share of what is assumed the variance of its velocities is more."""
+motion with it m^2, when that was s (-inf for never), how many in a row were not, how often it lost trust, by which
+share of what is assumed the variance of its velocities is more, and the variance m^2 of the noise of a fix in the mean
+innovation, axes together."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 WILD = 32.0

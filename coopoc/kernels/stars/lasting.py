@@ -1,9 +1,13 @@
-"""Errors of the ego's fixes that last: no state, but part of what its answer is uncertain by.
+"""Errors of fixes that last and that no sensor states: no state, but part of what the ego's answer is uncertain by.
 
 An error is what the filter sees of it, a fix less the estimate after the step. Those of white noise are uncorrelated;
 the covariance c of one with those of the second before is the variance of what lasts, the estimate's own error among
 it. Where c is more than its standard error s, the answer's covariance, axes together, is c - s^2 / c at least; what is
 added is shared as the variance of a fix is. What the estimate follows, and what all receivers share, nothing shows.
+
+In a star the errors of others show how far a receiver errs that nothing is wrong with: as far as the half of them that
+are nearest to another differ from that. Liars that are fewer, alike or not, and a wrong position of the ego, which all
+these errors have in common, hardly change it.
 
 References:
     Mehra, On the identification of variances and adaptive Kalman filtering, IEEE TAC 15(2), 1970 (correlated
@@ -14,8 +18,28 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from .cooperative_state import CLOCK, COVARIANCE, DT, ERRORS, FIX, FIX_VARIANCE, OUT, UNSAID, WHOLE, Filter, Model
-from .gaussian import COMMON, ERROR, has
+from ..compiling.small import inner_product, store, subtract
+from .cooperative_state import (
+    CLOCK,
+    COUNT,
+    COVARIANCE,
+    DT,
+    ERRORS,
+    FIX,
+    FIX_VARIANCE,
+    MEAN,
+    NOISE,
+    OUT,
+    TRUSTED,
+    UNSAID,
+    USED,
+    VEHICLE,
+    WHOLE,
+    Filter,
+    Model,
+    heard,
+)
+from .gaussian import ABSENT, COMMON, ERROR, has
 from .messages import vector_at
 
 RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
@@ -23,6 +47,42 @@ RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS 
 sum of squares of products m^2 of an error and the mean of those before it."""
 SECOND, MEMORY = 1.0, 100.0
 """s, in which an error fades, and in which products do."""
+FEWEST = 3
+"""Vehicles whose errors show what is usual, and fixes in the mean of one that is trusted."""
+OF_ERROR, NEAREST = 3, 4
+"""Behind an error in its row of `few`: its variance m^2, axes together, and, in order and not its own, the variance m^2
+that the nearest of the others shows."""
+
+
+@part
+def usual_error(f: Filter, but: int) -> float:
+    """Variance m^2 of an error of fixes that is usual in the star, without member `but`; 0 where too few show it."""
+    g, few, n = f.g, f.few, 0
+    for k in range(len(f.who)):
+        j = f.who[k, VEHICLE]
+        if k == but or j < 0 or (k > 0 and f.status[j, USED] == -math.inf):
+            continue
+        status, i = f.status[j], 3 * g.block[k, ERROR]
+        if status[TRUSTED] == 0.0:
+            store(few[n], 0, vector_at(g.x, i // 3))
+            few[n, OF_ERROR] = g.p[i, i] + g.p[i + 1, i + 1] + g.p[i + 2, i + 2]
+        elif status[COUNT] >= FEWEST:
+            store(few[n], 0, vector_at(status, MEAN // 3))
+            few[n, OF_ERROR] = status[NOISE] / status[COUNT]
+        else:
+            continue
+        n += 1
+    for i in range(n):
+        least, at = math.inf, i
+        for j in range(n):
+            gap = subtract(vector_at(few[i], 0), vector_at(few[j], 0))
+            square = inner_product(gap, gap) - few[i, OF_ERROR] - few[j, OF_ERROR]
+            least = min(least, max(square, 0.0) / 3.0) if j != i else least
+        while at > 0 and few[at - 1, NEAREST] > least:
+            few[at, NEAREST] = few[at - 1, NEAREST]
+            at -= 1
+        few[at, NEAREST] = least
+    return float(few[(n - 1) // 2, NEAREST]) if n >= FEWEST else 0.0
 
 
 @part
@@ -52,14 +112,15 @@ def remember_error(f: Filter, own: Floats) -> None:
 @part
 def add_lasting(f: Filter, model: Model, own: Floats) -> None:
     """Add to the answer's covariance what it is more uncertain by, as levels were otherwise, and the variance of errors
-    of fixes that last; pairs within two seconds count as one."""
+    of fixes that last: those of the ego, where pairs within two seconds count as one, or the mean of the star's."""
     for i in range(9):
         f.ego[COVARIANCE + i] *= 1.0 + f.ego[UNSAID] / max(f.ego[WHOLE], 1e-300)
     n, seconds = max(f.ego[PAIRS], 1.0), min(max(f.ego[CLOCK], SECOND), MEMORY)
     c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / seconds, 1.0 / n)
-    if model.forget == 0.0 or c <= 0.0 or c * c <= error:
+    if model.forget == 0.0:
         return
     stated = f.ego[COVARIANCE] + f.ego[COVARIANCE + 4] + f.ego[COVARIANCE + 8]
-    more = max(c - error / c - stated, 0.0) / sum(vector_at(own, FIX_VARIANCE // 3))
+    shown = c - error / c - stated if c > 0.0 and c * c > error else 0.0
+    more = max(shown, 3.0 * usual_error(f, ABSENT) / (1.0 + heard(f, True))) / sum(vector_at(own, FIX_VARIANCE // 3))
     for i in range(3):
         f.ego[COVARIANCE + 4 * i] += more * own[FIX_VARIANCE + i]

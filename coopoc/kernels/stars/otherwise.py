@@ -452,7 +452,9 @@ def moved(f: Filter, own: Floats) -> None:
     where it would be, had it not left."""
     q = sum(vector_at(own, MOTION_VARIANCE // 3))
     f.ego[MADE] += q
-    more, f.ego[WHOLE] = max(ego_variance(f) - f.ego[WHOLE], q), ego_variance(f)
+    p, before = ego_variance(f), f.ego[WHOLE]
+    f.ego[UNSAID] *= p / before if p < before else 1.0  # errors of odometry cancel on the way back
+    more, f.ego[WHOLE] = max(p - before, q), p
     if f.ego[NOW] > 0.0:  # where odometry alone leads
         level = math.exp(f.ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
         more = max(q - 3.0 * level * f.ego[CORRECTED], 0.0)
