@@ -21,7 +21,6 @@ from .starts.graph_starts import (
     STARTS,
     contenders,
     incremental_start,
-    loose_firsts,
     parts,
     position_variance,
     rotation_variance,
@@ -234,5 +233,6 @@ def _fixed(graph: Graph) -> tuple[int, ...]:
     edges = (graph.relative_pose, graph.relative_point, graph.ranges)
     part = parts(len(graph.names), *(each.nodes for each in edges))
     held = np.concatenate([graph.fixed, graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])
-    first = loose_firsts(part, np.flatnonzero(graph.is_pose), held)
+    loose = np.flatnonzero(graph.is_pose & ~np.isin(part, part[held]))
+    first = loose[np.unique(part[loose], return_index=True)[1]]
     return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())

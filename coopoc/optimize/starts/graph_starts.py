@@ -94,16 +94,6 @@ def parts(n: int, *joined: Ints) -> Ints:
     return part
 
 
-def loose_firsts(part: Ints, nodes: Ints, held: Ints) -> Ints:
-    """The first of the nodes in each part of all (n,) in which nothing is held.
-
-    >>> loose_firsts(np.array([0, 0, 1, 1]), np.array([1, 2, 3]), np.array([0])).tolist()
-    [2]
-    """
-    loose = nodes[~np.isin(part[nodes], part[held])]
-    return loose[np.unique(part[loose], return_index=True)[1]]
-
-
 def crossings(places: Floats, ranges: Floats) -> Floats:
     """(C, d) points where d of the spheres of `ranges` (K,) around `places` (K, d) meet, or come nearest to it; of many
     some are cut that are spread over all.
