@@ -120,8 +120,9 @@ class DenseCholesky:
         return np.asarray(whole[np.minimum(rows, columns), np.maximum(rows, columns)])
 
 
-def cholesky_of(matrix: Any) -> Cholesky | None:
-    """Factors of a sparse symmetric matrix (SciPy's, any format), or None: it is not positive definite.
+def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
+    """Factors of a sparse symmetric matrix (SciPy's, any format), or None: it is not positive definite. The group is
+    that of `Cholesky`.
 
     >>> from scipy.sparse import csc_array
     >>> cholesky_of(csc_array([[2.0, 1.0], [1.0, 2.0]])).solve(np.array([3.0, 3.0])).round(6)
@@ -135,7 +136,7 @@ def cholesky_of(matrix: Any) -> Cholesky | None:
     upper.sort_indices()
     if not (np.isfinite(upper.data).all() and (upper.diagonal() > 0).all()):
         return None
-    cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64))
+    cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64), group)
     return cholesky if cholesky.factor(upper.data) else None
 
 

@@ -13,7 +13,7 @@ from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked
 from ..model.problem import Problem
-from ..model.space import Space, carried, nearest_rotation
+from ..model.space import Space, carried, exp, log, nearest_rotation
 
 Roots = Iterable[tuple[int, Floats, Floats]]
 """(pose, position, rotation) in the order in which the walk may start from them."""
@@ -138,13 +138,17 @@ def chained(graph: Graph) -> Floats:
 
 def tree(graph: Graph) -> Floats:
     """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
-    between robots too, their rotations then `relaxed`, and with these all positions averaged; what it does not join
-    hangs on as in `chained`."""
+    between robots too, their rotations then averaged, in space `relaxed`, and with these all positions averaged; what
+    it does not join hangs on as in `chained`."""
     edges, roots, d = graph.relative_pose, _roots(graph), graph.dimension
     position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
     held = [root for root, _, _ in roots]
-    if len(edges):
+    (i, j), variance = edges.nodes.T, rotation_variance(edges.covariance, d)
+    if len(edges) and d == 3:
         rotation = relaxed(graph, rotation, held)
+    elif len(edges):  # angles add, so that one solve is exact
+        turns, _ = averaging(edges.nodes, variance, len(rotation), held)
+        rotation = exp(turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))) @ rotation
     space, seen = Space(d, has_rotation=True), (edges, graph.relative_point)
     at = space.position(with_points(graph, position, rotation, reached))
     (i, j), moved = np.concatenate([each.nodes for each in seen]).T, np.concatenate([each.position for each in seen])
@@ -174,7 +178,7 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
         (blocks.reshape(-1, d, d), edges.nodes.ravel(), 2 * np.arange(len(edges) + 1)), shape=(len(edges) * d, n * d)
     )
     far = PROXIMAL * np.median(weight) ** 2
-    factored, turned = cholesky_of(gaps.T @ gaps + far * eye_array(n * d)), rotation
+    factored, turned = cholesky_of(gaps.T @ gaps + far * eye_array(n * d), np.repeat(np.arange(n), d)), rotation
     for _ in range(SWEEPS):
         if factored is None:
             return rotation
