@@ -16,8 +16,6 @@ REGION = 2.0
 """Degrees that a fleet spans at most; robots that stand in a room, and tremble in motion capture, are metres apart."""
 LATEST = 1e11
 """s since 1970, the year 5138."""
-COARSE = 1e-3, 64.0
-"""s, between stamps of 32-bit floats: reported; of seconds since 1970, or GPS seconds, too coarse for steps."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 PLANE_STD = 0.01
@@ -204,14 +202,10 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
         )
 
 
-def check_time(t: Floats, file: str, column: str = "t") -> float:
-    """InputError where times (L,) s are beyond any date, or those of this century as 32-bit floats have them.
+def check_time(t: Floats, file: str, column: str = "t") -> None:
+    """InputError where times (L,) s are beyond any date.
 
-    Returns:
-        float: s, of which times are multiples where they are 32-bit floats and coarser than 1 ms; else 0.
-
-    >>> check_time(np.array([1.7e9]), "drive.csv"), check_time(np.array([1e5, 1e5 + 1 / 128]), "drive.csv")
-    (0.0, 0.0078125)
+    >>> check_time(np.array([1.7e9]), "drive.csv")
     """
     late = t[np.abs(t) > LATEST]
     if len(late):
@@ -221,17 +215,6 @@ def check_time(t: Floats, file: str, column: str = "t") -> float:
             "must be seconds: it looks like milliseconds or nanoseconds since 1970",
             "Pass scale=t:1e-3 or t:1e-9, or store dates.",
         )
-    unit = float(np.spacing(np.float32(np.abs(t).max(initial=0.0))))
-    if unit < COARSE[0] or (t % unit).any() or not (t % (2 * unit)).any():
-        return 0.0
-    if unit >= COARSE[1]:
-        raise InputError(
-            f"{file}: column {column}",
-            f"multiples of {unit:g} s, as of 32-bit floats",
-            "must be resolved",
-            "Write it in 64 bits, or from the first instant.",
-        )
-    return unit
 
 
 def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> None:

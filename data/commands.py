@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from coopoc import InputError
+from coopoc import InputError, plot_recording, plot_track
 
 from .fetch import TIMEOUT, Entry, fetch, public
 from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, load_log
@@ -105,7 +105,6 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     from tabulate import tabulate
 
     from .log.check import check as checked
-    from .log.picture import draw
 
     log = load_log(path)
     print(log.summary)
@@ -125,7 +124,8 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     for what in result.unseen:
         print(f"not seen: {what}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
-    draw(result, out)
+    drawn = plot_recording(result.log.recording, step=0)
+    plot_track(result.track, drawn, fleet=result.log.truth).figure.canvas.print_figure(out)
     print(f"picture: {out}", file=sys.stderr)
 
 

@@ -278,11 +278,6 @@ def test_a_folder_of_several_drives_is_refused_and_lists_them(tmp_path):
         (tmp_path / name / "m.csv").write_text("\n".join([rows[0], *table]))
     with refused("monday/m.csv: 0 to 48 s; tuesday/m.csv: 90000 to 90048 s; friday/m.csv.*a folder of its own"):
         co.read_log(tmp_path)
-    segment = tmp_path / "friday" / "40" / "processed_log" / "GNSS" / "live_gnss_ublox"
-    segment.mkdir(parents=True)
-    (segment / "value").write_bytes(b"")
-    with refused("friday/40: must be one log"):
-        co.read_log(tmp_path)
 
 
 def test_vehicles_that_come_later_are_of_one_drive(tmp_path):

@@ -1,9 +1,7 @@
 """Typical mistakes in logs: each ends in the message that docs/your_data.md shows, with file, row and column."""
 
-import io
 import re
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -340,14 +338,9 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path):
             load_log(f"{tmp_path / 'a.csv'}?{words}")
 
 
-@pytest.mark.parametrize("begin", [0.0, 1e5, 1.7e9])
-def test_stamps_of_32_bits_are_named(tmp_path, begin):
-    frame = pd.read_csv(io.StringIO(WIDE))
-    frame.assign(t=(begin + 99.93 * frame["t"]).astype("f4")).to_parquet(tmp_path / "log.parquet")
-    with refused("column t = multiples of 128 s") if begin > 1e9 else nullcontext():
-        summary = str(co.read_log(tmp_path / "log.parquet", origin=(1, 2, 3)).summary)
-        assert ("t is of 32-bit floats, multiples of 0.0078 s" in summary) == (begin == 1e5)
-        assert "origin= has no effect" in summary
+def test_an_origin_without_degrees_is_said_to_have_no_effect(tmp_path):
+    (tmp_path / "log.csv").write_text(WIDE)
+    assert "origin= has no effect" in str(co.read_log(tmp_path / "log.csv", origin=(1, 2, 3)).summary)
 
 
 def test_places_need_no_times(tmp_path):
@@ -372,7 +365,8 @@ def test_places_need_no_times(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("code", "kinds"), [(-1, ["range"]), (0, ["range"]), (9999, ["range"]), (511, ["heading"]), (0, ["x", "y"])]
+    ("code", "kinds"),
+    [(-1, ["range"]), (0, ["range"]), (9999, ["range"]), (511, ["heading"]), (0, ["x", "y"]), (10**9, ["x", "y"])],
 )
 def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
     """Every fourth row: the log is that with empty cells; one alone, or a mast at the origin, is what it says."""
@@ -387,7 +381,7 @@ def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
         frame.to_csv(tmp_path / name / "car.csv", index=False)
     a, b = (read_log(tmp_path / name) for name in "ab")
     assert same(a.recording, b.recording)
-    assert [number for why, (number, _) in a.summary.refused.items() if "none" in why] == [15 * len(kinds)]
+    assert sum(number for why, (number, _) in a.summary.refused.items() if "none" in why) == 15 * len(kinds)
     if (code, *kinds) in ((-1, "range"), (0, "range"), (511, "heading")):
         with refused("row 4"):
             read_log(tmp_path / "one")

@@ -147,6 +147,9 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     known = error(log(tmp_path / "known", "car", 1.0, 10, speed=speed, heading=course)[0], co.Kalman())
     read = log(tmp_path / "gyro", "car", 1.0, 10, **gyro)[0]
     assert error(read, co.Kalman()) < 1.5 * known
+    spun = gyro | {"speed": speed + 8.0 * ((T > 80) & (T < 110))}
+    notes = co.Kalman()(log(tmp_path / "spun", "car", 1.0, 10, **spun)[0].recording).notes
+    assert any(note.startswith("odometry, a: fails") for note in notes)
     coarse = co.read_log(tmp_path / "gyro", dt=0.5).recording
     pace = np.linalg.norm(coarse.velocity[0, 1:, 0], axis=1)
     assert np.nanmax(np.abs(pace - np.interp(coarse.t[1:], T, speed))) < 0.5

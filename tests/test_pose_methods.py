@@ -187,13 +187,12 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
     assert any(note.startswith("relative measurements, a and u: far from estimates (") for note in lost)
 
 
-@pytest.mark.parametrize("kind", [0, 1], ids=["ranges", "bearings"])
-def test_first_poses_come_from_one_kind_of_measurement_alone(kind):
+def test_first_poses_come_from_ranges_alone():
     """Landmarks far from the origin, without fixes and compass."""
     fleet = convoy(2, masts=5)
     fleet = replace(fleet, position=fleet.position + np.where(np.arange(7) % 2, 900.0, 920.0)[:, None])
     seen = observed(fleet, replace(WHITE, compass=False, gnss_std=(0.0,) * 3), runs=1, assumed=WHITE)
-    relative, fixes = np.where(np.arange(3) == kind, seen.relative, np.nan), np.array(seen.gnss)
+    relative, fixes = np.where(np.arange(3) == 0, seen.relative, np.nan), np.array(seen.gnss)
     fixes[:, :, :2] = np.nan
     begin = co.pose_start(replace(seen, gnss=fixes, relative=relative))[0, :2]
     assert np.linalg.norm((begin[:, :3] - fleet.position[0, :2])[:, :2], axis=1).max() < 1.0

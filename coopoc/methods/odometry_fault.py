@@ -27,7 +27,8 @@ def with_odometry(
     if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
         return recording, noise_model
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    columns = columns[~np.isin(columns, recording.landmarks) & ~recording.motion_extra[:, columns, 0].any(axis=0)]
+    more = recording.motion_extra[:, columns, 0]  # as uncertain at every step: fixes alone show the velocity
+    columns = columns[~np.isin(columns, recording.landmarks) & ~((more[0] > 0.0) & (np.ptp(more, axis=0) == 0.0))]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh = new_state(motion_noise(noise_model, recording.dt))
     variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)

@@ -75,7 +75,7 @@ EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of what is left out as it should be."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
-    "repeated rows": "Do stamps lack their fraction, as stamp.sec without nanosec, or do two vehicles share a name?",
+    "repeated rows": "Do stamps lack a fraction, as stamp.sec without nanosec, or in 32 bits? Do two share a name?",
     "fixes in gaps of the odometry": "Where a vehicle stands, log a speed of 0; raise max_gap= for longer gaps.",
     "relative measurements of members": PLACED,
     "odometry and headings of vehicles": PLACED,
@@ -256,10 +256,9 @@ def _of_vehicles(c: Check) -> list[str]:
                 "outliers, which a filter without a gate follows."
             )
         if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= 2:
-            word = "larger" if nis > 2 else "smaller"
             sentences.append(
-                f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "
-                "or correlated in time. Give std columns or sensors=."
+                f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
+                "as stated, or correlated in time. Give std columns or sensors=."
             )
         axes = _axes(c, column)
         sentences += [f"{name}: {axes}"] * bool(axes)

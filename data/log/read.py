@@ -218,9 +218,7 @@ def read_log(
     rows = rows.assign(value=rows["value"] - less)
     check_values(rows)
     for column in ("t", "arrival"):
-        unit = check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
-        if unit:
-            summary.assume(f"{column} is of 32-bit floats, multiples of {unit:.2g} s: write it in 64 bits")
+        check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
     _check_one_drive(rows, path)
     if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
@@ -324,13 +322,6 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = _files(path) if path.is_dir() else [path]
-        if segments := [str(p.relative_to(path)) for p in path.rglob("*") if p.is_dir() and is_segment(p)]:
-            raise InputError(
-                path.name,
-                ", ".join(sorted(segments)),
-                "must be one log; segments of comma2k19 are logs of their own",
-                "Name one of them, or the other files.",
-            )
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
         true_files = true_files or [f for f in files if TRUTH.fullmatch(f.stem) and f != path]
         files = [f for f in files if f not in true_files and (not TRUTH.fullmatch(f.stem) or f == path)]

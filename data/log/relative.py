@@ -162,8 +162,8 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         if len(bad) < LEAST_COUNT:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
-        x = c.x[links.step[rows]]
-        gaps = np.linalg.norm(x - x[:, [one]], axis=2) - measured[rows, None]
+        x = c.x[links.step[rows[bad]]]
+        gaps = np.linalg.norm(x - x[:, [one]], axis=2) - measured[rows[bad], None]
         for like, gap in zip(ids, gaps.T, strict=True):
             if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE_RATIO * np.median(expected) < 0.2 * size:
                 text += f", as if to {like}"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import InputError, Kalman, PoseFilter, Recording, pose_start
+from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.poses.pose_inputs import SPREAD
@@ -29,6 +29,7 @@ class Check:
         log: the part that was filtered.
         span: where that is, in words.
         world: its recording, in body frames turned into the world by the filter's headings.
+        track: of the filters.
         x: (T, N, 3) m, filter of each vehicle without relative measurements of others, NaN where it is absent.
         variance: (T, N, 3) m^2.
         fix: (T, N, 3) m, innovations of the fixes.
@@ -52,6 +53,7 @@ class Check:
     log: Log
     span: str
     world: Recording
+    track: Track
     x: Floats
     variance: Floats
     fix: Floats
@@ -173,7 +175,7 @@ def filtered(log: Log) -> Check:
     log = replace(log, recording=rec)
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
-    return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)))
+    return Check(log, span + start, world, track, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)))
 
 
 def plane(vectors: Floats) -> AnyArray:

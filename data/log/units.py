@@ -117,13 +117,14 @@ def place(rows: Rows) -> str:
 def without_codes(rows: Rows, summary: "Summary") -> Rows:
     """Rows but those whose number says that there was no measurement, as -1, 0 or 65.535 among ranges: one of few, each
     in several rows, that are far from what can be meant, or to and from which ranges and speeds leap."""
-    own = rows[in_group(rows, "odometry", "heading", "relative")]
+    own = rows[in_group(rows, "fix", "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
     size, limit = value.abs(), kind.map(LIMITS)
     wrong = (size > limit) | (value < kind.map(LEAST_VALUES)) | ((kind == "range") & (value == 0.0))
     usual = kind.map(size[~wrong].groupby(kind).max())
     near = (size > limit) & (size <= LEAP_RATIO * usual)  # as of an angle in degrees
-    codes = own[wrong & ~kind.isin(kind[near])].groupby("kind")["value"].agg(["size", "nunique"])
+    several = value[near].groupby(kind[near]).nunique()
+    codes = own[wrong & ~kind.isin(several.index[several > 1])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= MOST_CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
     for name in ("range", "speed", "speed_kmh", "z", "height"):

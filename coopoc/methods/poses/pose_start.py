@@ -18,8 +18,6 @@ HEADINGS, SEEN = 24, 3
 """That are tried, around the circle and then around the best of them; and from how many places at most."""
 STEP = 2 * np.pi / HEADINGS
 """rad."""
-ELSEWHERE, RIVAL = 3.1 * STEP, 9.0
-"""rad, and cost above the least, by which another heading makes one that bearings alone give a doubtful one."""
 
 
 def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> Floats:
@@ -38,19 +36,15 @@ def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> 
 
 
 def _next(recording: Recording, waiting: list[int], places: Floats) -> tuple[int, Ints]:
-    """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix, sees
-    two of them or has bearings of AIMED; else, of the one with most, those to all whose `places` (T, N, 3) m are
+    """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix or sees
+    two of them; else, of the one with most, those to all whose `places` (T, N, 3) m are
     finite."""
     every: list[Ints] = []
     for column in waiting:
         links = recording.links.of(column)
         marks = to_landmarks(recording, links)
-        there = np.isfinite(recording.relative[0, marks])
-        whole, aimed = (
-            len(np.unique(recording.links.neighbour[marks[each]])) for each in (there[:, :2].all(axis=1), there[:, 1])
-        )
-        fix = np.isfinite(recording.gnss[0, :, column, 0]).any()
-        if fix or whole > 1 or aimed >= AIMED:
+        whole = np.unique(recording.links.neighbour[marks[np.isfinite(recording.relative[0, marks, :2]).all(axis=1)]])
+        if len(whole) > 1 or np.isfinite(recording.gnss[0, :, column, 0]).any():
             return column, marks
         every.append(links[np.isfinite(places[recording.links.step[links], recording.links.neighbour[links], 0])])
     most = int(np.argmax([np.isfinite(recording.relative[0, links, :2]).all(axis=1).sum() for links in every]))
@@ -74,16 +68,11 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
         own = replace(filter_, spread=(*spread, turn))
         copies = recording.of_runs(np.zeros(len(poses), int))
         x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
-        return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, column, poses[:, 3], noise)
+        return x[:, :, 0], cov[:, :, 0], cost[:, 0]
 
-    bare = np.isnan(recording.gnss[0, :, column, 0]).all() and np.isnan(recording.relative[0, links, 0]).all()
     for turn in (STEP / 2, 2 * STEP / HEADINGS):
         poses = _hypotheses(recording, column, links, landmarks, angles)
-        costs = filtered(poses, turn)[2]
-        best = poses[[np.argmin(costs)]]
-        apart = np.abs(wrap(poses[:, 3] - best[0, 3])) > ELSEWHERE
-        if bare and (costs[apart] < costs.min() + RIVAL).any():
-            raise _too_little(recording, column)
+        best = poses[[np.argmin(filtered(poses, turn)[2])]]
         angles = best[0, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
     (x,), (cov,), _ = filtered(best, STEP / 2)
     return _back(recording, column, x, cov), x[:, :3]
@@ -129,22 +118,9 @@ def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
     )
 
 
-def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: Sensors) -> Floats:
-    """(hypotheses,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
-    links = recording.links.of(column)
-    links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
-    step, other = recording.links.step[links], recording.links.neighbour[links]
-    gap = recording.gnss[0, step, other] - recording.gnss[0, step, column]
-    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _reckoned(recording, column)[0][step]
-    residual = wrap(recording.relative[0, links, 1] + angles[:, None] - azimuth)
-    fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
-    cost: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
-    return cost
-
-
-AIMED, SHARP, WINDOW = 4, 0.1, 5.0
-"""Landmarks to which there are bearings at least: three leave a pose open near the circle through them; m, of places
-beside a line, below which ranges leave the side open; and s for which measurements count once all were seen."""
+SHARP, WINDOW = 0.1, 5.0
+"""m, of places beside a line, below which ranges leave the side open; and s for which measurements count once all were
+seen."""
 
 
 def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
@@ -157,7 +133,7 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     compass = body.heading[0, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
-        return _of_parts(recording, column, links, places, angles, (turns, way))
+        return _of_ranges(recording, column, links, places, angles, way)
     if (
         not len(fixes)
         and np.isnan(body.heading[0, :, column]).all()
@@ -177,43 +153,24 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     return np.column_stack([position.reshape(-1, 3), np.repeat(angles, len(step))])
 
 
-def _of_parts(
-    recording: Recording,
-    column: int,
-    links: Ints,
-    places: Floats,
-    angles: Floats,
-    odometry: tuple[Floats, ...],
-) -> Floats:
-    """(hypotheses, 4) poses that ranges alone, or bearings of landmarks alone, leave for each heading."""
-    (turns, way), relative = odometry, recording.relative[0, links]
-    standing = np.isin(recording.links.neighbour[links], recording.landmarks)
-    ranged, aimed = (np.flatnonzero(np.isfinite(relative[:, k]) & (standing | (k == 0))) for k in (0, 1))
-    for rows, is_range in ((ranged, True), (aimed, False)):
-        at, first = np.unique(places[rows], axis=0, return_index=True)
-        spread = np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) if len(at) else 0
-        if (spread < 2) if is_range else (len(at) < AIMED):
-            continue
-        steps = recording.links.step[links[rows]]
-        early = steps <= steps[first.max()] + WINDOW / recording.dt
-        rows, steps = rows[early], steps[early]
-        centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
-        if is_range:  # squared ranges differ linearly
-            right = np.square(centres[..., :2]).sum(axis=-1) - relative[rows, 0] ** 2
-            matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
-        else:  # a place lies nowhere beside its direction
-            ahead = angles[:, None] + turns[steps] + relative[rows, 1]
-            matrix = np.stack([np.sin(ahead), -np.cos(ahead)], axis=-1)
-            right = (matrix * centres[..., :2]).sum(axis=-1)
-        position = (np.linalg.pinv(matrix) @ right[..., None])[:, :2, 0]
-        return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
-    raise _too_little(recording, column)
+def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, angles: Floats, way: Floats) -> Floats:
+    """(hypotheses, 4) poses that ranges alone, whose squares differ linearly, leave for each heading, by odometry
+    `way` (T, 3) m."""
+    rows = np.flatnonzero(np.isfinite(recording.relative[0, links, 0]))
+    at, first = np.unique(places[rows], axis=0, return_index=True)
+    if not len(at) or np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) < 2:
+        raise _too_little(recording, column)
+    steps = recording.links.step[links[rows]]
+    early = steps <= steps[first.max()] + WINDOW / recording.dt
+    rows, steps = rows[early], steps[early]
+    centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
+    right = np.square(centres[..., :2]).sum(axis=-1) - recording.relative[0, links[rows], 0] ** 2
+    matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
+    position = (np.linalg.pinv(matrix) @ right[..., None])[:, :2, 0]
+    return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
 
 
 def _too_little(recording: Recording, column: int) -> InputError:
     actual = f"{recording.ids[column]} has no fix and sees too little in {recording.t[-1] - recording.t[0]:g} s"
-    allowed = (
-        "must hold a fix, bearings of four landmarks that leave no doubt, or, of these and of vehicles whose poses "
-    )
-    allowed += "are found, a range and bearing or three ranges"
+    allowed = "must hold a fix, or a range and bearing or three ranges, of landmarks or vehicles whose poses are found"
     return InputError("seconds", actual, allowed, "Take more seconds, or give its pose.")
