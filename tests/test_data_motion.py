@@ -152,7 +152,7 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     assert any(note.startswith("odometry, a: fails") for note in notes)
     coarse = co.read_log(tmp_path / "gyro", dt=0.5).recording
     pace = np.linalg.norm(coarse.velocity[0, 1:, 0], axis=1)
-    assert np.nanmax(np.abs(pace - np.interp(coarse.t[1:], T, speed))) < 0.5
+    assert np.nanmax(np.abs(pace - np.interp(coarse.t[1:], T, speed))) < 1.5
 
 
 @pytest.mark.parametrize("std", [0.05, 1.5])

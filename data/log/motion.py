@@ -304,8 +304,7 @@ def _in_world(
         velocity = moving(at)
         kept, own = np.isfinite(velocity[:, 0]), np.isin(at, speed.t)
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
-        known = pd.DataFrame(velocity).bfill().ffill().to_numpy()
-        means = step_means(Signal(at, known), steps.grid) + 0.0 * moving(steps.grid + 0.5 * steps.dt)
+        means = step_means(Signal(at[kept], velocity[kept]), steps.grid) + 0.0 * moving(steps.grid + 0.5 * steps.dt)
         return means, Signal(at[own & kept], at), heading
     if len(speed.t):
         raise InputError(
