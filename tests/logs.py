@@ -96,6 +96,14 @@ def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: 
     return pd.DataFrame({"t": t, "vehicle": name, "partner": other, "range": noisy, "range_std": std})
 
 
+def noisy(rng: np.random.Generator, t: Any, name: str, columns: dict[str, tuple[Any, float]]) -> pd.DataFrame:
+    """What one vehicle measures, in a wide table: kind -> (truth, std)."""
+    measured = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
+    return pd.DataFrame(
+        {"t": t, "vehicle": name, **measured, **{f"{kind}_std": std for kind, (_, std) in columns.items()}}
+    )
+
+
 def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
     """Vehicles on bends through all directions at 8 m/s, 12 m apart; `climb` m of height that come and go."""
     t = 0.02 * np.arange(int(minutes * 3000))

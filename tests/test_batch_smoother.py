@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused, textbook, without
+from conftest import coming_and_going, refused, standing, textbook, without
 from oracles.batch_smoother import batch_smoother
 from scipy import stats
 from scipy.optimize import least_squares
@@ -154,7 +154,7 @@ def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing):
 @pytest.mark.parametrize("least", [1e-3, 1e-6, 1e-9])
 def test_who_hardly_moves_does_not_drown_the_rest(least, crossing):
     """Motion known to a nanometre, all at rest: SciPy's solution of the whole drive as one point per vehicle."""
-    fleet = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
+    fleet = standing(crossing.position[0], 60)
     recording = observe(fleet, replace(S2, velocity_floor=1e-12), V2X(max_neighbours=4))
     known = NoiseModel("fitted", S2, process_std=(least, least, least), gnss_std=(3.0, 3.5, 4.0))
     track = textbook(BatchSmoother(known))(recording, range(8))

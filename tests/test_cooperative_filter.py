@@ -27,6 +27,7 @@ from coopoc.world.recording import MEASURED
 from coopoc.world.spoofing import Spoofing, spoofed
 
 S2 = Sensors.paper_scenario2()
+EITHER = pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
 
 
 def drive(steps: int = 80) -> Fleet:
@@ -216,7 +217,7 @@ def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
                 assert errors(track, fleet)[:, late:].max() < 8.0
 
 
-@pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
+@EITHER
 @pytest.mark.parametrize(("most", "start", "end"), [(0, 0, 20), (0, 20, 30), (0, 20, 50), (1, 0, 20), (1, 20, 50)])
 def test_fixes_that_were_wrong_are_forgotten_soon_after(priors, most, start, end):
     """Law: fixes that are wrong for 10 to 30 s, at first or later, cost no more 10 s after than in a Kalman filter that
@@ -233,7 +234,7 @@ def test_fixes_that_were_wrong_are_forgotten_soon_after(priors, most, start, end
 
 
 @pytest.mark.parametrize("step", [1, 5])
-@pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
+@EITHER
 def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
     """Law: fixes that are led 60 m away, and are right again, are believed soon after: where they and odometry agree
     is remembered beside a neighbour whose range does not contradict it, too. It took them for wrong for good."""
@@ -418,10 +419,9 @@ def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int,
 
 def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured():
     """White noise as assumed, steps of 1 s, a third of the messages lost: not worse than the textbook's filter."""
-    town = load_fleet("town10-validation")
-    fleet = Fleet(town.ids, town.t[::10], town.position[::10], town.velocity[::10]).select(range(0, 30))
-    there = np.flatnonzero(np.isfinite(fleet.position[..., 0]).all(axis=0))
-    moving = replace(fleet.select(there), velocity=np.gradient(fleet.select(there).position, fleet.dt, axis=0))
+    fleet = every(load_fleet("town10-validation"), 10).select(range(30))
+    moving = fleet.select(np.flatnonzero(fleet.present.all(axis=0)))
+    moving = replace(moving, velocity=np.gradient(moving.position, fleet.dt, axis=0))
     seen = observe(moving, S2, V2X(4, radius=60.0, loss=0.35), runs=4, observers=[0, 1, 2])
     links = np.concatenate([seen.links.of(ego) for ego in range(3)])
     truth = moving.position[seen.links.step[links], seen.links.neighbour[links]]
@@ -458,7 +458,7 @@ def test_an_odometry_that_is_mirrored_is_asked_about_again():
     assert ours < kalman
 
 
-@pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
+@EITHER
 def test_clocks_of_neighbours_are_found(priors):
     """Messages of a third that hold what was 0.5 s ago cost an eighth of the error, not a third; the others' clocks
     are right. Both are the same drive with the same draws."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from logs import noisy
 from strange_logs import strange
 
 import coopoc as co
@@ -141,12 +142,7 @@ def test_odometry_of_one_that_errs_is_no_clock_of_others(tmp_path, pace, factor,
         columns |= {
             f"range_{other}": (abs(at - x[own]), 0.1) for other, at in zip("abcd", x, strict=True) if other != name
         }
-        noisy = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
-        tables.append(
-            pd.DataFrame({"t": t, "vehicle": name, **noisy}).assign(
-                **{f"{kind}_std": columns[kind][1] for kind in columns}
-            )
-        )
+        tables.append(noisy(rng, t, name, columns))
     pd.concat(tables).to_csv(tmp_path / "log.csv", index=False)
     text = said(tmp_path)
     assert re.findall(rf"(\w): its odometry is {words}", text) == ["b"]

@@ -13,7 +13,7 @@ from logs import bends, drive, fixes, long, motion, observed, ranges, write
 from numpy.testing import assert_allclose
 
 import coopoc as co
-from coopoc.cli import main
+from coopoc.cli import _status
 from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
@@ -242,9 +242,7 @@ def test_the_commands_take_a_log_and_options(folders, tmp_path, capsys, monkeypa
     monkeypatch.chdir(tmp_path)
 
     def shell(*words):
-        with pytest.raises(SystemExit) as ended:
-            main(list(words))
-        return int(ended.value.code or 0), capsys.readouterr().out
+        return _status([*words]), capsys.readouterr().out
 
     status, out = shell("data", "check", str(folders / "with"), "--picture", "a.png")
     assert status == 0

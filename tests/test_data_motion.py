@@ -20,6 +20,9 @@ from coopoc.data.log.read import Log
 from coopoc.kernels.constant_velocity import constant_velocity
 
 T = np.round(np.arange(0, 180, 0.1), 1)
+TUNNEL = [k for k in range(0, len(T), 10) if not 600 < k < 900]
+"""Steps that have a fix."""
+FILTERS = co.Kalman(), co.JointFilter(), co.CooperativeFilter()
 
 
 def path(name: str) -> Floats:
@@ -96,7 +99,7 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, nam
     x = path(name)[np.searchsorted(T, t)]
     densities = 10.0 ** np.arange(-3, 3.1, 0.5)
     best = min(np.sqrt(np.square(filtered(t, z, std, q)[0] - x).sum(axis=1).mean()) for q in densities)
-    for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter())[: 2 + (name != "town")]:
+    for method in FILTERS[: 2 + (name != "town")]:
         assert error(read, method) < 1.15 * best
     assert "the odometry, which they else follow" not in " ".join(check(read).warnings)
 
@@ -107,7 +110,7 @@ def test_each_fix_counts_as_it_is_stated(tmp_path):
     u = speed * np.exp(1j * course) + np.random.default_rng(2).normal(0, 0.1, (len(T), 2)) @ [1, 1j]
     std = np.where(poor, 3.0, 0.02)[:, None]
     read = log(tmp_path, "car", std, 2, vx=u.real, vy=u.imag, vz=0 * T, vx_std=0 * T + 0.1)[0]
-    for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter(), co.BatchSmoother()):
+    for method in (*FILTERS, co.BatchSmoother()):
         off = np.linalg.norm(method(read.recording).x[0, :, 0] - path("car"), axis=1)
         assert off[~poor].mean() < 0.06
         assert off[poor].mean() < 0.7
@@ -118,7 +121,7 @@ def test_a_vehicle_without_odometry_adds_no_noise_to_that_of_others(tmp_path):
     alone = log(tmp_path, "car", 1.5, 10, vx=speed * np.cos(course), vy=speed * np.sin(course), vz=0 * T)[0]
     pd.read_csv(tmp_path / "a.csv", usecols=["t", *"xyz"]).dropna().to_csv(tmp_path / "b.csv", index=False)
     both = co.read_log(tmp_path)
-    for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter(), co.BatchSmoother()):
+    for method in (*FILTERS, co.BatchSmoother()):
         assert_allclose(method(both.recording, ["a"]).x, method(alone.recording, ["a"]).x, atol=1e-6)
     assert not any(text.startswith("b") for text in check(both).warnings)
 
@@ -165,9 +168,7 @@ def test_the_speed_of_a_slow_robot_is_along_its_course(tmp_path, std):
 @pytest.mark.parametrize("method", [co.Kalman(), co.CooperativeFilter()])
 def test_a_course_that_is_held_without_fixes_is_lost_on_bends(tmp_path, method):
     """Behind a tunnel of half a minute, without a gyro."""
-    read = log(tmp_path, "car", 1.5, 10, steps=[k for k in range(0, len(T), 10) if not 600 < k < 900], speed=car()[0])[
-        0
-    ]
+    read = log(tmp_path, "car", 1.5, 10, steps=TUNNEL, speed=car()[0])[0]
     track = method(read.recording)
     behind = np.flatnonzero(read.recording.t > 92)
     off = np.linalg.norm(track.x[0, behind, 0] - read.truth.position[behind, 0], axis=1)
@@ -204,12 +205,12 @@ def test_nothing_looks_ahead(tmp_path, given):
 
 def test_a_gap_splits_a_drive_in_every_method(tmp_path):
     """Law: beyond a gap a method is what it is on the drive behind it alone."""
-    read = log(tmp_path, "car", 1.5, 10, steps=[k for k in range(0, len(T), 10) if not 600 < k < 900])[0]
+    read = log(tmp_path, "car", 1.5, 10, steps=TUNNEL)[0]
     rec, truth = read.recording, read.truth
     assert truth is not None
     (first, _), second = rec.stretches("a")
     assert first == 0
-    for method in (co.GNSS(), co.Kalman(), co.JointFilter(), co.CooperativeFilter(), co.MSMV()):
+    for method in (co.GNSS(), *FILTERS, co.MSMV()):
         track = method(rec)
         assert 20 < track.absent.sum() < 32
         assert np.isnan(track.x[:, track.absent[:, 0]]).all()
@@ -258,7 +259,7 @@ def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     rec = co.read_log(tmp_path / "a.csv").recording
     known = np.flatnonzero(np.isfinite(rec.gnss[0, :, 0, 0]))
     assert len(known) == len(t)
-    for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter()):
+    for method in FILTERS:
         far = np.linalg.norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)
         assert (far[4:] < 2.6).all()
 

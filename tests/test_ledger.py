@@ -45,9 +45,10 @@ def test_the_papers_training_costs_as_much_as_an_hour_of_driving():
 
 
 def test_a_ledger_refuses_what_does_not_fit():
+    none = np.zeros((2, 2, 1, 1))
     with refused("seconds"):
-        Ledger(("a",), np.zeros(2), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)))
+        Ledger(("a",), np.zeros(2), none, none)
     with refused("names"):
-        Ledger(("a",), np.zeros(1), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)), servers=("server",))
+        Ledger(("a",), np.zeros(1), none, none, servers=("server",))
     with refused("kind"):
         of_training(["a"], [1.0], [1.0]).of("training", "wire")  # type: ignore[arg-type]

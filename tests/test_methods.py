@@ -16,11 +16,12 @@ from coopoc.world.recording import MEASURED
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 COVARIANCES = {f"{name}-{noise}": (name, noise) for name in METHODS for noise in ("identity", "nominal")}
+EACH = pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
 SNAPSHOTS = {"gnss"}
 """Methods without a memory: alone they give the fix."""
 
 
-@pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
+@EACH
 def test_zero_noise_gives_zero_error(name, noise, crossing):
     method = METHODS[name](noise)
     fleet = crossing.between(0, 40)
@@ -28,7 +29,7 @@ def test_zero_noise_gives_zero_error(name, noise, crossing):
     assert errors(method(recording, [0, 3]), fleet).max() < 1e-6
 
 
-@pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
+@EACH
 def test_a_run_and_a_step_know_nothing_of_others(name, noise, crossing):
     """One run is the first of five, a short drive the beginning of a long one (estimates are causal), and seconds count
     from anywhere."""
@@ -44,7 +45,7 @@ def test_a_run_and_a_step_know_nothing_of_others(name, noise, crossing):
 
 
 @pytest.mark.parametrize("channel", [V2X(max_neighbours=0), V2X(4, loss=1.0)], ids=["alone", "no message arrives"])
-@pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
+@EACH
 def test_without_messages_it_is_the_solo_method(name, noise, channel, crossing):
     """The Kalman filter with its covariance, or the fix; flat priors of positions weigh 1e-6 of a fix. The
     cooperative filter assumes that nothing is wrong."""

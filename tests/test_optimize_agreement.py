@@ -146,8 +146,7 @@ def test_every_backend_agrees_on_robust_losses(backend, name, loss):
             solve(problem, EVERY[backend])
         return
     ours, theirs = solve(problem), solve(problem, EVERY[backend])
-    assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
-    assert theirs.x == pytest.approx(ours.x, abs=1e-6)
+    same_minimum(theirs, ours)
 
 
 def backends_lacking(backend: str, problem: Problem) -> list[str]:

@@ -2,19 +2,16 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import measured
 from graph_files import write_graph
-from shell import ran
+from shell import ROOT, ran
 
-from coopoc.cli import main
+from coopoc.cli import _status
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import backends, solver_commands
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
@@ -43,10 +40,7 @@ def file(tmp_path):
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as end:
-        main(list(words))
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
+    return _status([*words]), *capsys.readouterr()
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -133,17 +134,20 @@ def test_the_robust_curvature_is_casadis():
     assert 3 < sum(signs) < len(signs) - 3
 
 
+def gtsams_gnc(problem: Problem, loss: Any) -> tuple[Any, Any]:
+    """Graph and GncLMOptimizer at the same probability, all but the second fixes known inliers."""
+    graph, params = gtsams(problem), gtsam.GncLMParams()
+    params.setLossType(loss)
+    params.setKnownInliers(list(range(graph.size() - 12)))
+    params.setRelativeCostTol(0.0)
+    return graph, gtsam.GncLMOptimizer(graph, values(solve(problem).x), params)
+
+
 @pytest.mark.parametrize("wrong", [0, 1, 5, 9])
 def test_gtsam_doubts_the_same_measurements(wrong):
-    """GncLMOptimizer at the same probability, all but the second fixes known inliers."""
     for seed in range(3):
         problem = native(seed, wrong)
-        graph, start = gtsams(problem), solve(problem).x
-        params = gtsam.GncLMParams()
-        params.setLossType(gtsam.GncLossType.TLS)
-        params.setKnownInliers(list(range(graph.size() - 12)))
-        params.setRelativeCostTol(0.0)
-        theirs = gtsam.GncLMOptimizer(graph, values(start), params)
+        graph, theirs = gtsams_gnc(problem, gtsam.GncLossType.TLS)
         result = theirs.optimize()
         ours = solve_gnc(problem, candidates=[3])
         assert np.array_equal(ours.extras["weights"], theirs.getWeights()[-12:])
@@ -163,9 +167,5 @@ def test_geman_mcclure_ends_where_its_loss_is_least():
         stated = replace(problem, factors=(*problem.factors[:3], replace(problem.factors[3], loss=loss)), x0=ours.x)
         least = solve(stated)
         assert least.x == pytest.approx(ours.x, abs=1e-4)
-        graph, params = gtsams(problem), gtsam.GncLMParams()
-        params.setLossType(gtsam.GncLossType.GM)
-        params.setKnownInliers(list(range(graph.size() - 12)))
-        params.setRelativeCostTol(0.0)
-        theirs = gtsam.GncLMOptimizer(graph, values(solve(problem).x), params).optimize()
-        assert least.cost == pytest.approx(gtsams(stated).error(theirs), rel=1e-3)
+        theirs = gtsams_gnc(problem, gtsam.GncLossType.GM)[1]
+        assert least.cost == pytest.approx(gtsams(stated).error(theirs.optimize()), rel=1e-3)

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
 from coopoc.formats.graph import Graph, PoseEdges
-from coopoc.optimize import Loss, Problem, solve, solve_gnc
+from coopoc.optimize import Loss, Problem, Solution, solve, solve_gnc
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import Space, exp
@@ -60,14 +60,22 @@ def test_landmarks_beside_a_plane_are_mirrored(seed):
     assert any("minimum" in note for note in found.notes) == (sorted(costs)[1] < found.cost + 10)
 
 
+def beside(graph: Graph) -> list[Solution]:
+    """From the truth, and from a start of our own to the graph without it."""
+    problems = (
+        from_graph(graph, start="file"),
+        from_graph(replace(graph, position=np.full_like(graph.position, np.nan))),
+    )
+    return [solve(problem, covariance=False) for problem in problems]
+
+
 def test_ranges_that_are_eased_lead_from_bad_odometry():
     """As low as from the truth, which the graph does not hold."""
     w, rng = world(2, 2, 2, 250), np.random.default_rng(2)
     pairs = np.sort(rng.integers(0, 500, (500, 2)), axis=1)
     moved = w.relative(w.chain(), 0.3, 0.15)
     graph = w.graph(relative_pose=moved, ranges=w.ranged(pairs[pairs[:, 0] < pairs[:, 1]], 0.2))
-    truth = solve(from_graph(graph, start="file"), covariance=False)
-    found = solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan))), covariance=False)
+    truth, found = beside(graph)
     assert found.extras["start"] == "eased"
     assert found.cost <= truth.cost * (1 + 1e-6)
     assert "may be the truth" in truth.notes[0]
@@ -169,8 +177,7 @@ def test_drones_that_range_landmarks_end_as_low_as_from_the_truth_or_say_so(seed
     """The image of a landmark that adds 1,785 before the drive gives way; two starts that end apart."""
     w = world(seed, 3, 1, 500, 5)
     graph = w.graph(relative_pose=w.relative(w.chain(), 0.05, 0.02), ranges=w.ranged(w.to_points(400), 0.5))
-    truth = solve(from_graph(graph, start="file"), covariance=False)
-    found = solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan))), covariance=False)
+    truth, found = beside(graph)
     assert found.cost <= truth.cost * (1 + 1e-6) or (found.notes and not reached)
 
 
@@ -229,8 +236,8 @@ def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
 
     for module in (race, graph_starts):
         monkeypatch.setattr(module, "arrive", counted)
-    found = solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan))))
-    assert found.cost == pytest.approx(solve(from_graph(graph, start="file")).cost, rel=1e-6)
+    truth, found = beside(graph)
+    assert found.cost == pytest.approx(truth.cost, rel=1e-6)
     assert sizes.count(max(sizes)) < 30
 
 

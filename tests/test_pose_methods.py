@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from logs import noisy
 
 import coopoc as co
 from coopoc.evaluate.metrics import nees_band, share_of_average
@@ -166,9 +167,7 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
             longer = 0.2 + rng.exponential(3, len(t)) * (rng.random(len(t)) < wild)
             columns[f"range_{mark}"] = np.abs(gap) + longer, 0.05
             columns |= {f"bearing_{mark}": (np.angle(gap * np.exp(-1j * heading)), 0.05)} if bearings else {}
-        noisy = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
-        noisy |= {f"{kind}_std": std for kind, (_, std) in columns.items()}
-        tables.append(pd.DataFrame({"t": t, "vehicle": name, **noisy}))
+        tables.append(noisy(rng, t, name, columns))
         truths.append(
             pd.DataFrame({"t": t, "vehicle": name, "x": place.real, "y": place.imag, "heading": wrap(heading)})
         )

@@ -14,7 +14,7 @@ import pytest
 from conftest import refused
 from test_report import Page
 
-from coopoc.cli import main
+from coopoc.cli import _status
 from coopoc.study import store
 from coopoc.study.publish import tables, views
 from coopoc.study.reference import Reference
@@ -73,12 +73,6 @@ def files(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file()}
 
 
-def status(*words: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(list(words))
-    return int(ended.value.code or 0)
-
-
 @pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_weights_run_no_code_that_their_card_names(evil, tmp_path):
     torch = pytest.importorskip("torch")
@@ -99,7 +93,7 @@ def test_results_run_no_code_that_their_manifest_names(folder, evil, command, mo
     path, mark = evil
     monkeypatch.chdir(folder.parent)
     edited(folder / "manifest.json", lambda m: {**m, "study": f"{path}:STUDY"})
-    assert status(command, str(folder)) == (0 if command == "table" else 2)
+    assert _status([command, str(folder)]) == (0 if command == "table" else 2)
     assert not mark.exists()
 
 
@@ -114,16 +108,16 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(tmp_path, capsys):
     mine, out = f"{tmp_path / 'mine.py'}:STUDY", str(tmp_path / "mine")
     run_study(mine, tmp_path)
     given = ["reference", out]
-    assert status(*given, "--write") == 2
+    assert _status([*given, "--write"]) == 2
     assert "is not installed. If it is a file of your own, name it: coopoc reference" in capsys.readouterr().err
-    assert status(*given, "--study", mine.replace("STUDY", "OTHER")) == 2
-    assert status(*given, "--write", "--study", mine) == 0
-    assert status(*given, "--study", mine) == 0
+    assert _status([*given, "--study", mine.replace("STUDY", "OTHER")]) == 2
+    assert _status([*given, "--write", "--study", mine]) == 0
+    assert _status([*given, "--study", mine]) == 0
     assert "2 of 2 reference numbers hold." in capsys.readouterr().out
     assert "reference numbers" not in (tmp_path / "mine" / "views.json").read_text()  # no finding of the study
     known = Reference.load(tmp_path / "known.json")
     replace(known, numbers=tuple(replace(n, value=0.5 * n.value) for n in known.numbers)).save(tmp_path / "lower.json")
-    assert status(*given, "--study", mine, "--file", str(tmp_path / "lower.json")) == 1
+    assert _status([*given, "--study", mine, "--file", str(tmp_path / "lower.json")]) == 1
     assert "2 worse" in capsys.readouterr().out
 
 

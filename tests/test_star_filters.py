@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import holed, textbook
+from conftest import holed, standing, textbook
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
@@ -178,7 +178,7 @@ def test_it_is_whatever_the_noise(crossing, pair, noise):
 
 def test_a_state_without_process_noise_stays_finite(crossing):
     known = NoiseModel("fitted", S2, (1e-60, 1e-30, 1e-60))
-    still = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
+    still = standing(crossing.position[0], 60)
     recording = observe(still, S2, V2X(max_neighbours=4, loss=0.2), runs=2)
     track = textbook(JointFilter(known))(recording, [1])
     mean = recording.gnss[:, :, 1].mean(axis=1)

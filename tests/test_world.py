@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import among, refused, standing
 from scipy import stats
+from test_methods import SILENT
 
 from coopoc import (
     V2X,
@@ -120,10 +121,9 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
 
 
 def test_zero_noise_may_act_but_not_be_assumed(crossing):
-    silent = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
     with refused(r"gnss_std.*assumed=Sensors"):
-        observe(crossing, silent)
-    recording = observe(crossing, silent, assumed=S2)
+        observe(crossing, SILENT)
+    recording = observe(crossing, SILENT, assumed=S2)
     assert np.array_equal(recording.gnss[0], crossing.position)
 
 
