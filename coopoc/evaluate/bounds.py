@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from ..arrays import Bools, Floats, Ints, checked, instance, refuse
 from ..errors import InputError
 from ..kernels.stars.messages import FORGOTTEN
-from ..workers import progress_bar
+from ..workers import one_thread, progress_bar
 from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet, columns
 from ..world.links import Links, spherical
@@ -409,7 +409,8 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
     """
     filtered: list[Floats] = []
     cov: Floats = np.zeros((0, 0))
-    with progress_bar(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0) as bar:
+    bar = progress_bar(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0)
+    with bar, one_thread():
         for t, stage in enumerate(stages):
             information = _onward(cov, stage) + stage.gained
             cov = np.linalg.inv(information)

@@ -1,23 +1,19 @@
 """Sparse Cholesky factors of a Hessian with their analysis kept: solve, definiteness, marginals of any unknowns."""
 
 from contextlib import nullcontext
-from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+from ...workers import one_thread
 
 ALONE = 64
-"""Rows from which BLAS would share so small a matrix among threads, which wait for one another far longer."""
+"""Unknowns from which BLAS shares matrices among threads."""
 
 
-@cache
-def _blas() -> Any:
-    """What limits the threads of BLAS, found once."""
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController().select(user_api="blas")
+def _unshared(size: int) -> Any:
+    return one_thread() if size > ALONE else nullcontext()
 
 
 class Cholesky:
@@ -49,7 +45,8 @@ class Cholesky:
         """Factor an upper triangle's values; whether it is positive definite."""
         from ...kernels.graphs.multifrontal import factorise
 
-        return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
+        with _unshared(len(self._rank)):
+            return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
 
     @property
     def pivots(self) -> Floats:
@@ -71,7 +68,8 @@ class Cholesky:
         """
         from ...kernels.graphs.multifrontal import places, selected_inverse
 
-        inverse = selected_inverse(self._fronts, self._factor)
+        with _unshared(len(self._rank)):
+            inverse = selected_inverse(self._fronts, self._factor)
         return inverse[places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
@@ -92,14 +90,13 @@ class DenseCholesky:
 
         self._dpotrf, self._dpotri, self._dpotrs = dpotrf, dpotri, dpotrs
         self._size = len(indptr) - 1
-        self._alone = partial(_blas().limit, limits=1) if self._size > ALONE else nullcontext
         self._place = np.asarray(indices) + self._size * np.repeat(np.arange(self._size), np.diff(indptr))
 
     def factor(self, values: Floats) -> bool:
         """Factor an upper triangle's values; whether it is positive definite."""
         matrix = np.zeros(self._size**2)
         matrix[self._place] = values
-        with self._alone():
+        with _unshared(self._size):
             self._root, info = self._dpotrf(matrix.reshape(self._size, -1).T, clean=0, overwrite_a=1)
         return bool(info == 0)
 
@@ -110,12 +107,12 @@ class DenseCholesky:
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        with self._alone():
+        with _unshared(self._size):
             return np.asarray(self._dpotrs(self._root, rhs)[0])
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
         """A^-1 at pairs of unknowns (K,)."""
-        with self._alone():
+        with _unshared(self._size):
             whole = self._dpotri(self._root)[0]
         return np.asarray(whole[np.minimum(rows, columns), np.maximum(rows, columns)])
 
