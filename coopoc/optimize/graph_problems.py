@@ -1,7 +1,7 @@
 """A graph of poses and landmarks as a Problem, and where to start it."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -95,8 +95,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
     won = Search(first)
     if start == "auto":
-        starts = {name: partial(_x0, graph, poses, name) for name in contenders(graph)} | {"odometry": lambda: start_x}
-        problem, won = _raced(graph, problem, starts)
+        problem, won = _raced(graph, problem)
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
@@ -105,14 +104,12 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
 
 
-def _raced(
-    graph: Graph,
-    problem: Problem,
-    starts: Mapping[str, Callable[[], Floats]],
-    draws: bool = False,
-) -> tuple[Problem, Search]:
+def _raced(graph: Graph, problem: Problem, draws: bool = False) -> tuple[Problem, Search]:
     """The race of what a graph offers; the problem starts at chained odometry."""
-    late: dict[str, Any] = {}
+    starts: dict[str, Callable[[], Floats]] = {
+        name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
+    }
+    starts["odometry"], late = lambda: np.asarray(problem.x0), dict[str, Any]()
     if not graph.guess and np.isfinite(graph.position).all():
         late["file"] = lambda _: (_x0(graph, problem.poses, "file"), 0)
     if problem.poses:
@@ -135,11 +132,8 @@ def started(problem: Problem) -> Problem:
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
-        starts: dict[str, Callable[[], Floats]] = {
-            name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
-        }
-        at = problem.replace_unchecked(x0=frozen(directed(problem, starts["odometry"]())))
-        at, won = _raced(graph, at, starts, True)
+        at = problem.replace_unchecked(x0=frozen(directed(problem, _x0(graph, problem.poses, "odometry"))))
+        at, won = _raced(graph, at, True)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

@@ -135,11 +135,6 @@ class Incremental:
             raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
         self._steps, self._slots = self._steps + 1, count + graph.size()
 
-    def _at(self, part: Problem, keys: Sequence[int], first: int, x: Floats) -> Floats:
-        """(n, ambient) the nodes of a step, new ones where they are guessed."""
-        at = [x[k - first] if k >= first else self[int(k)] for k in keys]
-        return np.array(at).reshape(len(keys), part.space.ambient)
-
     def _graph(self) -> Any:
         return self.isam.getFactors() if self.lag else self.isam.getFactorsUnsafe()
 
@@ -171,7 +166,8 @@ class Incremental:
                     held.update(nodes if len(nodes) == 1 or not held.isdisjoint(nodes) else [])
         loose = {first + k for k, turned in enumerate(turns) if turned} - {keys[k] for k in held}
         if loose:
-            at = self._at(part, keys, first, x)
+            here = [x[k - first] if k >= first else self[int(k)] for k in keys]
+            at = np.array(here).reshape(len(keys), part.space.ambient)
             points = np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
             vague = [Factor("position", points[:, None], at[points, :d], std=np.full(d, LOOSE))] if len(points) else []
             known = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))

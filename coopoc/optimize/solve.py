@@ -116,9 +116,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem, result = _drawn(problem, backend, options, result)
     search = problem.search
     solved = clock()
-    x, iterations, infeasible = result.x, result.iterations, result.infeasible
+    x, iterations = result.x, result.iterations
     truth = assess(problem, x, covariance)
-    status = Status.INFEASIBLE if infeasible else _status(problem, x, truth)
+    status = Status.INFEASIBLE if result.infeasible else _status(problem, x, truth)
     extras = result.extras | (search.extras if search.start else {})
     if truth.active is not None and status is Status.INFEASIBLE:
         extras["violated"] = truth.active.violated

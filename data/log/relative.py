@@ -158,7 +158,8 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
-        bad = long_off(np.abs(wrap(less) if k else less) / expected)
+        errors = pd.Series(np.abs(wrap(less) if k else less) / expected).rolling(WINDOW, 1, center=True)
+        bad = np.flatnonzero(errors.median() > OUTLYING)  # most of WINDOW are too large
         if len(bad) < LEAST_COUNT:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
@@ -203,11 +204,6 @@ def _other_angle(c: Check) -> str:
     if 3 * (least := min(left.values(), default=np.inf)) > np.median(np.abs(residual)):
         return ""
     return f"They look like {next(like for like, rest in left.items() if rest <= 1.5 * least)}."
-
-
-def long_off(errors: Floats) -> Ints:
-    """Indices at which most of WINDOW normalised errors (M,) are too large."""
-    return np.flatnonzero(pd.Series(errors).rolling(WINDOW, 1, center=True).median() > OUTLYING)
 
 
 def when(t: Floats, bad: Ints) -> str:

@@ -57,12 +57,12 @@ class Entries:
         row, column = row[:, None], column[:, None]
         return self.entry[block, np.where(turned, column, row), np.where(turned, row, column)]
 
-    @cached_property
-    def own(self) -> tuple[Bools, Ints, Ints]:
-        """(n, dof, dof) where both directions of a node can move, and their unknowns."""
-        row, column = np.broadcast_arrays(self.number[:, :, None], self.number[:, None, :])
-        free = (row >= 0) & (column >= 0)
-        return free, row[free], column[free]
+
+def pairs_of(number: Ints) -> tuple[Bools, Ints, Ints]:
+    """(M, k, k) where two of the k directions of each row of `number` can move, and their unknowns."""
+    row, column = np.broadcast_arrays(number[:, :, None], number[:, None, :])
+    free = (row >= 0) & (column >= 0)
+    return free, row[free], column[free]
 
 
 def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:

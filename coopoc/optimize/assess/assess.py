@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
-from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
+from ..algebra.sparse import Entries, Sparse, pairs_of, shared_layout, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, unchecked
 from ..model.problem import Problem, several
@@ -156,7 +156,7 @@ def _largest(problem: Problem, entries: Entries, numbers: Floats) -> Floats:
 def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]:
     """Marginals (n, dof, dof) under the noise that is stated, and their diagonal (m,); the cost's factor is at hand."""
     system, stated = sparse(problem), as_stated(problem)
-    free, rows, columns = system.entries.own
+    free, rows, columns = pairs_of(system.entries.number)
     blocks, cov = np.full(len(rows), np.nan), np.zeros(free.shape)
     if stated is problem or system.cholesky.factor(sparse(stated).quadratic(x, model)[2]):
         blocks = system.cholesky.inverse(rows, columns)
@@ -216,12 +216,10 @@ def _unobservable(
     across their line by the curvature of ranges that are too short, and pushed off it by longer ones. A gradient bends
     a direction that nothing sees by as much as its share: along a circle about an anchor by |g| / radius.
     """
-    from scipy.sparse import diags_array, eye_array
+    from scipy.sparse import eye_array
 
     ways = eye_array(J.shape[1], format="csc") if active is None else active.exact
-    J = J @ ways
-    largest = abs(J).max(axis=1).toarray().ravel()
-    J = (diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J).tocsc()  # the weights of rows hide no direction
+    J = _evened(J @ ways).tocsc()
     length = np.sqrt(J.power(2).sum(axis=0))
     measured = length > 0
     null = _null_rows(J[:, measured], length[measured])
@@ -243,6 +241,14 @@ def _unobservable(
         moves[moving] = ways_squared[:, np.abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
     moves = moves.reshape(len(problem.names), -1).sum(axis=1)
     return tuple(compress(problem.names, moves > 1e-6))
+
+
+def _evened(J: Any) -> Any:
+    """Rows of J (sparse) over their largest number: their weights hide no direction."""
+    from scipy.sparse import diags_array
+
+    largest = abs(J).max(axis=1).toarray().ravel()
+    return diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J
 
 
 def _null_rows(J: Any, length: Floats) -> Floats:
@@ -279,10 +285,7 @@ def _seen(J: Any, ways: Floats) -> Bools:
     Along a direction that nothing measures the terms of every row cancel to rounding; where one is only weakly held,
     some row keeps a share of its terms.
     """
-    from scipy.sparse import diags_array
-
-    largest = abs(J).max(axis=1).toarray().ravel()
-    rows = diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J
+    rows = _evened(J)
     left, terms = np.abs(rows @ ways), abs(rows) @ np.abs(ways)
     matters = terms > 1e-6 * terms.max(axis=0)  # a chain bends by angles that are small beside its length
     return np.asarray((matters & (left > CANCELLED * terms)).any(axis=0))

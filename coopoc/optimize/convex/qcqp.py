@@ -281,8 +281,7 @@ def _range(rows: _Rows, factor: Factor) -> None:
 def _pose(rows: _Rows, factor: Factor) -> None:
     """w (t_i - z), and w (R_i^T - R_z^T H)."""
     (i,), d = factor.nodes.T, rows.d
-    w, angular = _weights(factor, d)
-    frame, turn = np.tile(rows.frame, (len(i), 1)), np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
+    (w, angular, turn), frame = _weighed(factor, d), np.tile(rows.frame, (len(i), 1))
     rows.add([w, -w * (factor.z[:, None, :d] - rows.origin)], [rows.position(i), frame])
     rows.add([angular * np.eye(d), -angular * turn], [rows.rotation(i), frame])
 
@@ -290,10 +289,9 @@ def _pose(rows: _Rows, factor: Factor) -> None:
 def _relative(rows: _Rows, factor: Factor) -> None:
     """w (t_j - t_i - z R_i^T), as rows, and of a relative pose w (R_j^T - R_ij^T R_i^T)."""
     (i, j), d = factor.nodes.T, rows.d
-    w, angular = _weights(factor, d)
+    w, angular, turn = _weighed(factor, d)
     rows.add([-w, w, -w * factor.z[:, None, :d]], [rows.position(i), rows.position(j), rows.rotation(i)])
     if factor.z.shape[1] > d:
-        turn = np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
         rows.add([-angular * turn, angular * np.eye(d)], [rows.rotation(i), rows.rotation(j)])
 
 
@@ -310,13 +308,14 @@ WORLD = ("position", "displacement", "pose_chordal")
 """Measurements in the world's frame."""
 
 
-def _weights(factor: Factor, d: int) -> tuple[Floats, Floats]:
-    """(M, 1, 1) of the position and, if there is one, of the rotation; InputError if either is not one number."""
+def _weighed(factor: Factor, d: int) -> tuple[Floats, Floats, Floats]:
+    """Weights (M, 1, 1) of the position and, if there is one, of the rotation, and R_z^T of that; InputError if either
+    is not one number."""
     root = factor.root
     position, turn = one_weight(root[:, :d, :d]), one_weight(root[:, d:, d:])
     if position is None or turn is None or root[:, :d, d:].any() or root[:, d:, :d].any():
         _refuse(factor)
-    return position[:, None, None], turn[:, None, None]
+    return position[:, None, None], turn[:, None, None], np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
 
 
 def one_weight(root: Floats) -> Floats | None:

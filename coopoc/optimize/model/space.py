@@ -6,6 +6,7 @@ import numpy as np
 
 from ...arrays import TWO_TURNS, Floats, checked, number, refuse
 from ...errors import InputError
+from ...formats.values import to_orientation
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def exp(w: Floats) -> Floats:
 def log(rotation: Floats) -> Floats:
     """Angles (..., 1) or rotation vectors (..., 3), rad, of rotation matrices (..., d, d): the inverse of `exp`."""
     if rotation.shape[-1] == 2:
-        return np.arctan2(rotation[..., 1, :1], rotation[..., 0, :1])
+        return to_orientation(rotation)
     from scipy.spatial.transform import Rotation
 
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from ..algebra.sparse import sparse
+from ..algebra.sparse import pairs_of, sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.derivatives import linearise
 from ..model.factor import taken
@@ -273,11 +273,9 @@ def predicted(marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats
         # an angle between nodes that coincide has no derivative
         lost = ~np.isfinite(r).all(axis=1) | ~np.isfinite(J).all(axis=(1, 2))
         r, J = np.where(lost[:, None], 0.0, r), np.where(lost[:, None, None], 0.0, J)
-        number = system.entries.number[factor.nodes].reshape(len(J), -1)
-        row, column = np.broadcast_arrays(number[:, :, None], number[:, None])
-        free = (row >= 0) & (column >= 0)
-        P = np.zeros(row.shape)
-        P[free] = system.cholesky.inverse(row[free], column[free])
+        free, *pairs = pairs_of(system.entries.number[factor.nodes].reshape(len(J), -1))
+        P = np.zeros(free.shape)
+        P[free] = system.cholesky.inverse(*pairs)
         S = J @ P @ np.swapaxes(J, 1, 2) + np.eye(factor.size)
         lost |= ~np.isfinite(S).all(axis=(1, 2))
         variance, axes = np.linalg.eigh(np.where(lost[:, None, None], np.eye(factor.size), S))
