@@ -20,7 +20,7 @@ from coopoc.optimize.starts.graph_starts import tree, walk
 from coopoc.optimize.starts.windings import rewound
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from unseen_graphs import ranged_drives, world
+from unseen_graphs import lost, ranged_drives, world
 
 
 def scipys(problem: Problem, start: Floats) -> float:
@@ -64,7 +64,7 @@ def beside(graph: Graph) -> list[Solution]:
     """From the truth, and from a start of our own to the graph without it."""
     problems = (
         from_graph(graph, start="file"),
-        from_graph(replace(graph, position=np.full_like(graph.position, np.nan))),
+        from_graph(lost(graph)),
     )
     return [solve(problem, covariance=False) for problem in problems]
 

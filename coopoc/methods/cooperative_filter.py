@@ -79,7 +79,9 @@ class Priors(NamedTuple):
     forget: float = 10.0
 
 
-AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
+NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
+"""Of velocities that fixes have shown."""
+AS_STATED = NO_ODOMETRY._replace(fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
 ON_ROADS = Priors(
     heading=0.03,
@@ -96,8 +98,6 @@ ON_ROADS = Priors(
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 STATED = ON_ROADS._replace(exact=0.0, fix=1.5)
 """Of those whose log states how far its odometry errs: that none errs otherwise is as likely as not."""
-NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
-"""Of velocities that fixes have shown."""
 
 
 class Broadcast(NamedTuple):

@@ -113,8 +113,9 @@ def pose_of(d: int, x: Floats) -> Any:
     return gtsam.Pose3(gtsam.Rot3(x[3:].reshape(3, 3)), x[:3])
 
 
-def _poses(d: int, x: Floats) -> Iterable[tuple[Any, ...]]:
-    return ((pose_of(d, each),) for each in x)
+def _between(name: str, d: int, z: Floats, root: Floats) -> list[Part]:
+    """The part of poses (M, ambient) from one pose to another."""
+    return [Part({(POSE, POSE): f"{name}Pose{d}"}, ((pose_of(d, each),) for each in z), root)]
 
 
 PLAIN: Mapping[str, Names] = {
@@ -153,13 +154,12 @@ def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     size, first = (3, 2) if d == 2 else (6, 0)
     root = np.zeros((len(W), size, size))
     root[:, first : first + size - d, first : first + size - d] = W[:, d:, d:]
-    return [*chord, Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
+    return [*chord, *_between("BetweenFactor", d, factor.z, root)]
 
 
 def _relative_log(factor: Factor, W: Floats, d: int) -> Form:
     """GTSAM's errors in space are those of the rotation first."""
-    root = W if d == 2 else np.roll(W, -d, axis=2)
-    return [Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
+    return _between("BetweenFactor", d, factor.z, W if d == 2 else np.roll(W, -d, axis=2))
 
 
 def _chord(W: Floats, z: Floats, d: int) -> Form:
@@ -180,8 +180,7 @@ def _chord(W: Floats, z: Floats, d: int) -> Form:
     scale = np.sqrt(np.einsum("mii->mi", information))
     if (np.abs(information - expected) > WEIGHT_TOLERANCE * scale[:, :, None] * scale[:, None, :]).any():
         return None
-    root = np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1])
-    return [Part({(POSE, POSE): f"FrobeniusBetweenFactorPose{d}"}, _poses(d, z), root)]
+    return _between("FrobeniusBetweenFactor", d, z, np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1]))
 
 
 def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:

@@ -208,14 +208,19 @@ def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     rows = constraint_rows(problem, x)
     if not rows.outside.any():
         return x, True
-    matrix, weight, feasible = csc_matrix(rows.matrix), np.ones(rows.matrix.shape[1]), True
+    size = rows.matrix.shape[1]
+
+    def least(weight: Floats, matrix: Any) -> Floats:
+        programme = Programme(diags(weight, format="csc"), csc_matrix(matrix))
+        return programme.solve(weight, 0.0 * weight, *rows.sides)[0]
+
     try:
-        step, _ = Programme(diags(weight, format="csc"), matrix).solve(weight, 0.0 * weight, *rows.sides)
+        step, feasible = least(np.ones(size), rows.matrix), True
     except Infeasible:
-        slack, feasible = csc_matrix(hstack([matrix, eye(len(rows.value))])), False
-        weight = np.concatenate([STEP_WEIGHT * weight, np.ones(len(rows.value))])
-        step, _ = Programme(diags(weight, format="csc"), slack).solve(weight, 0.0 * weight, *rows.sides)
-    return problem.space.retract(x, step[: matrix.shape[1]].reshape(len(x), -1)), feasible
+        slack = np.ones(len(rows.value))
+        step = least(np.append(np.full(size, STEP_WEIGHT), slack), hstack([rows.matrix, eye(len(slack))]))
+        feasible = False
+    return problem.space.retract(x, step[:size].reshape(len(x), -1)), feasible
 
 
 BACKEND = Backend(

@@ -296,7 +296,7 @@ class Constraint:
             bad = np.argwhere(wrong)[0]
             bad_row = f"[{self.lower[tuple(bad)]}, {self.upper[tuple(bad)]}] in row {bad[0]}"
             raise InputError(f"bounds of {self.kind}", bad_row, "must have lower <= upper", "No point can satisfy it.")
-        if np.isinf(self.lower).all() and np.isinf(self.upper).all():
+        if not bounded(self).any():
             raise InputError(f"bounds of {self.kind}", "none", "must bound something", "Leave the constraint out.")
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import AnyArray, Floats, Ints, checked, frozen, instance, plain
+from ...arrays import AnyArray, Floats, Ints, checked, frozen, plain
 from ...errors import InputError, shown
 from ..assess.assess import squared
 from ..model.factor import Factor, reweighed
@@ -64,7 +64,6 @@ class Marked:
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
     """The problem with its candidates, checked; their bounds are yet to be given."""
-    instance("problem", problem, Problem)
     places: list[tuple[int, int]] = []
     for item in candidates if isinstance(candidates, Sequence) else [candidates]:
         k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
