@@ -242,7 +242,6 @@ def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float)
 
 def _unpacked(entry: Entry, files: list[str], data: bytes) -> dict[str, bytes]:
     """Bytes of files in an archive, whichever folder they are in there."""
-    reason = ""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {(Path(one.filename).name, one.file_size): one for one in archive.infolist()}

@@ -390,7 +390,7 @@ def against_truth(c: Check) -> Check:
     return replace(c, relative=np.where(fit[:, None], relative, np.nan), expected=expected)
 
 
-def on_time(c: Check, alike: bool = True) -> Check:
+def on_time(c: Check, alike: bool) -> Check:
     """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share, and
     less what wrong ones explain."""
     reference = None

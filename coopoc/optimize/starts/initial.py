@@ -75,12 +75,8 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
 
 
 def somewhere(problem: Problem) -> Floats:
-    """(n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
-
-    Raises:
-        InputError: poses without an x0.
-    """
-    if problem.x0 is not None or problem.poses:
+    """(n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem."""
+    if problem.x0 is not None:
         return initial_guess(problem)
     x = np.zeros((len(problem.names), problem.dimension))
     fixes = [f for f in problem.factors if f.kind == "position"]
