@@ -262,8 +262,9 @@ def pose_start(recording: Recording, *, seconds: float = START, gate: float = ST
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
     odometry until then its pose at the first step; or, by least squares, its ranges to three landmarks or more. A solo
-    filter starts from each of some headings around the circle, then around the best; the one whose innovations have the
-    largest likelihood over the first seconds is kept, and odometry leads back from where that is surest. A compass
+    filter starts from each of some headings around the circle, then around the best; the one whose innovations, and
+    bearings of other vehicles from fix to fix, have the largest likelihood over the first seconds is kept, and odometry
+    leads back from where that is surest. A compass
     leaves one. Vehicles without a fix that see fewer than two landmarks come last: for them those that were found
     before are places, too.
 

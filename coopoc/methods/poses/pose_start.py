@@ -68,7 +68,7 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
         own = replace(filter_, spread=(*spread, turn))
         copies = recording.of_runs(np.zeros(len(poses), int))
         x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
-        return x[:, :, 0], cov[:, :, 0], cost[:, 0]
+        return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, column, poses[:, 3], noise)
 
     for turn in (STEP / 2, 2 * STEP / HEADINGS):
         poses = _hypotheses(recording, column, links, landmarks, angles)
@@ -116,6 +116,20 @@ def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
         range_std=float(np.hypot(noise.range_std, fix)),
         azimuth_std=float(np.hypot(noise.azimuth_std, fix / apart)),
     )
+
+
+def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: Sensors) -> Floats:
+    """(hypotheses,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading: what
+    shows that of a vehicle that stands."""
+    links = recording.links.of(column)
+    links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
+    step, other = recording.links.step[links], recording.links.neighbour[links]
+    gap = recording.gnss[0, step, other] - recording.gnss[0, step, column]
+    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _reckoned(recording, column)[0][step]
+    residual = wrap(recording.relative[0, links, 1] + angles[:, None] - azimuth)
+    fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
+    cost: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
+    return cost
 
 
 SHARP, WINDOW = 0.1, 5.0
