@@ -5,6 +5,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -36,16 +38,30 @@ def _blas() -> Any:
     return ThreadpoolController().select(user_api="blas")
 
 
-def one_thread() -> Any:
+_LOCK = threading.Lock()
+_limits: list[Any] = []
+"""Of the contexts that are open; the first one knows what was before."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
     """A context in which BLAS does not share a matrix among threads, which wait for one another: where another process
-    has one of two cores, 180 rows take 80 times as long as alone.
+    has one of two cores, 180 rows take 80 times as long as alone. The last of several to be left restores what was.
 
     >>> import numpy as np
     >>> with one_thread():
     ...     np.linalg.inv(np.diag([2.0]))
     array([[0.5]])
     """
-    return _blas().limit(limits=1)
+    with _LOCK:
+        _limits.append(_blas().limit(limits=1))
+    try:
+        yield
+    finally:
+        with _LOCK:
+            first = _limits.pop()
+            if not _limits:
+                first.restore_original_limits()
 
 
 LINE_SECONDS = 60.0

@@ -7,6 +7,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from coopoc.kernels.graphs.multifrontal import supernodes
 from coopoc.optimize.algebra.cholesky import Cholesky, DenseCholesky
+from coopoc.workers import one_thread
 
 
 def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
@@ -87,3 +88,14 @@ def test_small_matrices_are_factored_by_one_thread():
     with threadpool_limits(2):
         assert cholesky.factor(np.ones(150))
     assert threads == {1}
+
+
+def test_contexts_of_one_thread_that_overlap_restore_the_threads():
+    """Of two threads the first to enter may be the first to leave; one thread was left for good."""
+    with threadpool_limits(2):
+        first, second = one_thread(), one_thread()
+        for context in (first, second):
+            context.__enter__()
+        for context in (first, second):
+            context.__exit__(None, None, None)
+        assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {2}

@@ -316,7 +316,7 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     near, narrow = distance(s, mean)
     if count < 3.0 or near < 2.0 * (odds + REVOKE_LOG_ODDS):
         return False
-    usual, tau2 = usual_error(f, k) if k > 0 else 0.0, TAU**2  # of the ego's all others tell
+    usual, tau2 = usual_error(f, k) if k > 0 else 0.0, TAU**2  # the ego's receiver is compared with all others
     s = add_diagonal(s, (usual, usual, usual))
     near, narrow = distance(s, mean)
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)

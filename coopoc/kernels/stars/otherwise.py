@@ -453,7 +453,7 @@ def moved(f: Filter, own: Floats) -> None:
     q = sum(vector_at(own, MOTION_VARIANCE // 3))
     f.ego[MADE] += q
     p, before = ego_variance(f), f.ego[WHOLE]
-    f.ego[UNSAID] *= p / before if p < before else 1.0  # errors of odometry cancel on the way back
+    f.ego[UNSAID] *= p / before if p < before else 1.0  # errors of a heading cancel on a circle
     more, f.ego[WHOLE] = max(p - before, q), p
     if f.ego[NOW] > 0.0:  # where odometry alone leads
         level = math.exp(f.ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
