@@ -1,17 +1,13 @@
 """CPU seconds until the first answer of each method, solve and stream: everything that a user waits for.
 
     OMP_NUM_THREADS=1 python benchmarks/compile.py [NAME ...]        # some minutes; a Markdown table on stdout
-    python benchmarks/compile.py --record                            # renew the seconds that a line on stderr names
 
 Each name runs in a process of its own, from its start to its answer, twice: with an empty cache of machine code, and
 again with what the first run has kept. The difference is compiled once per machine.
 """
 
 import argparse
-import importlib
-import json
 import os
-import pkgutil
 import resource
 import subprocess
 import sys
@@ -27,15 +23,12 @@ from unseen_graphs import joined, world
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.optimize.graph_problems import from_graph
-from coopoc.world.storage import save_recording
 
 Call = Callable[[], object]
 S = co.Sensors.paper_scenario2()
 BODY = co.Sensors(heading_std=0.05, yaw_rate_std=0.02)
 GATED = ("kalman", "joint", "cooperative-filter", "batch-smoother", "pose filter, fleet", "solve of a graph")
 """Rows of the gate."""
-MODULES = ("coopoc.kernels", "coopoc.learned.engine")
-"""Packages that hold compiled functions."""
 
 
 def drive() -> co.Fleet:
@@ -43,18 +36,14 @@ def drive() -> co.Fleet:
     return co.load_fleet("town10").between(0, 12)
 
 
-def method(name: str, stored: bool = False) -> None:
-    """A method of the catalogue, with neighbours and messages that are late or lost; of a stored recording, too."""
+def method(name: str) -> None:
+    """A method of the catalogue, with neighbours and messages that are late or lost."""
     made, whole, v2x = (
         METHODS[name]("nominal"),
         needs_whole_fleet(name),
         co.V2X(max_neighbours=3, loss=0.1, latency=0.2),
     )
     seen = co.observe(drive(), S, v2x, runs=2, observers=None if whole else [24])
-    if stored:
-        with tempfile.TemporaryDirectory() as folder:
-            save_recording(seen, Path(folder) / "seen.npz")
-            seen = co.read_log(Path(folder) / "seen.npz").recording
     track = made(seen, range(len(seen.ids)) if whole else [24])
     if track.covariance is not None:
         co.nees(track, drive())
@@ -145,58 +134,14 @@ def measured() -> list[dict[str, Any]]:
     ]
 
 
-def all_kernels() -> list[Any]:
-    """Every compiled function of the package, of modules that no call has imported, too."""
-    from coopoc.kernels.compiling.compile import kernels
-
-    for package in map(importlib.import_module, MODULES):
-        for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-            importlib.import_module(module.name)
-    return kernels
-
-
-def run_all() -> list[Any]:
-    """Make every call; the kernels that then have machine code of this process.
-
-    Raises:
-        SystemExit: a kernel that no call compiles.
-    """
-    for name, call in CALLS.items():
-        print(f"{name} ...", file=sys.stderr)
-        call()
-        if name in METHODS:
-            method(name, stored=True)
-    kernels = all_kernels()
-    if missing := [kernel.py_func.__qualname__ for kernel in kernels if not kernel.signatures]:
-        sys.exit(f"no call compiles {', '.join(missing)}")
-    return kernels
-
-
-def record() -> None:
-    """Renew the table of the seconds that kernels take to compile, in a process with an empty cache."""
-    from coopoc.kernels.compiling import compile
-
-    if "NUMBA_CACHE_DIR" not in os.environ:
-        with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, __file__, "--record"]
-            subprocess.run(command, env={**os.environ, "NUMBA_CACHE_DIR": folder, "OMP_NUM_THREADS": "1"}, check=True)
-        return
-    run_all()
-    table = {name: round(seconds, 1) for name, seconds in sorted(compile.seconds.items()) if seconds > 1}
-    Path(compile.__file__).with_name("usual_seconds.json").write_text(json.dumps(table, indent=1) + "\n")
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Time what is named, or all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", choices=[*CALLS, []], metavar="NAME")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--record", action="store_true")
     given = parser.parse_args(arguments)
     if given.here:
         CALLS[given.names[0]]()
-    elif given.record:
-        record()
     else:
         rows = [(name, *(f"{s:.1f}" for s in first_and_again(name))) for name in given.names or CALLS]
         print(tabulate(rows, ["CPU s until the first answer of", "first call", "again"], "github"))

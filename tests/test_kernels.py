@@ -4,14 +4,12 @@ import importlib
 import os
 import pickle
 import sys
-from io import StringIO
 
 import pytest
 from shell import python
-from tqdm import tqdm
 
 from coopoc import workers
-from coopoc.kernels.compiling import compile, machine_code
+from coopoc.kernels.compiling import machine_code
 
 pytest.importorskip("numba")
 
@@ -64,18 +62,6 @@ def test_stale_machine_code_of_types_that_are_gone_is_made_again(tmp_path):
         version = pickle.load(file)
     index.write_bytes(pickle.dumps(version) + b"cno_such_module\nThing\n.")
     assert (run(), run()) == ("8.0 0\n", "8.0 1\n")
-
-
-def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch):
-    """A bar that is open while a kernel compiles begins to count when it has; a line says what and how long."""
-    said = StringIO()
-    monkeypatch.setattr(sys, "stderr", said)
-    with tqdm(total=1, delay=2.0, file=said) as bar:
-        began = bar.start_t
-        compile._hold_bars(5.0)
-        compile._say(compile._line(compile.compiled))
-        assert bar.start_t == began + 5.0
-    assert said.getvalue() == "compiling the compile kernel, once per machine\n"
 
 
 def test_a_bar_fills_no_log_with_carriage_returns(capsys):

@@ -1,15 +1,12 @@
 """How kernels are compiled: machine code at the first call, kept on disk, no interpreter's lock."""
 
 import gc
-import json
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from .waiting import clock, spent, waiting
@@ -63,16 +60,10 @@ def storage(function: Function) -> Function:
     return cast(Function, _made(function, set(), inline="always"))
 
 
-USUAL_SECONDS: dict[str, float] = json.loads((Path(__file__).parent / "usual_seconds.json").read_text("utf-8"))
-"""CPU seconds that a kernel took to compile where `benchmarks/compile.py` was run, of those above a second."""
 QUIET_SECONDS = 2.0
 """s of compiling after which a line on stderr reports it."""
 PLAIN = "COOPOC_PLAIN_NJIT"
 """Environment variable: 1 compiles by numba's public interface alone."""
-kernels: list[Any] = []
-"""Every compiled function of the modules that are imported, in order."""
-seconds: dict[str, float] = {}
-"""CPU seconds that kernels took to compile in this process."""
 
 
 @cache
@@ -95,12 +86,14 @@ def _watch() -> None:
     class Watcher(event.Listener):
         timers: list[threading.Timer] = []  # noqa: RUF012
         collects = True
-        began = used = 0.0
+        began = 0.0
 
         def on_start(self, event: Any) -> None:
-            self.timers.append(threading.Timer(QUIET_SECONDS, _say, [_line(event.data["dispatcher"].py_func)]))
+            title = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
+            line = f"compiling the {title} kernel, once per machine"
+            self.timers.append(threading.Timer(QUIET_SECONDS, print, [line], {"file": sys.stderr}))
             if len(self.timers) == 1:
-                self.began, self.used = clock(), time.process_time()
+                self.began = clock()
                 self.timers[0].daemon = True
                 self.timers[0].start()
                 self.collects = gc.isenabled()
@@ -109,45 +102,11 @@ def _watch() -> None:
         def on_end(self, event: Any) -> None:
             self.timers.pop().cancel()
             if not self.timers:
-                seconds[_name(event.data["dispatcher"].py_func)] = time.process_time() - self.used
-                _hold_bars(took := clock() - self.began)
-                spent.compile += took
+                spent.compile += clock() - self.began
             if self.collects and not self.timers:
                 gc.enable()
 
     event.register("numba:compile", Watcher())
-
-
-def _name(function: Any) -> str:
-    return f"{function.__module__}.{function.__qualname__}"
-
-
-def _line(function: Any) -> str:
-    """What is said of a kernel that compiles for more than QUIET_SECONDS."""
-    usual = USUAL_SECONDS.get(_name(function), 0.0)
-    title = function.__module__.rpartition(".")[2].replace("_", " ")
-    often = f", usually {usual:.0f} s on an idle core" if usual > QUIET_SECONDS else ""
-    return f"compiling the {title} kernel, once per machine{often}"
-
-
-def _bars() -> list[Any]:
-    """Progress bars that are open."""
-    tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)
-    return list(getattr(tqdm, "_instances", ()))
-
-
-def _say(line: str) -> None:
-    """Print a line to stderr, above a progress bar that is shown."""
-    if shown := [bar for bar in _bars() if bar.last_print_t > bar.start_t]:
-        shown[0].write(line, file=sys.stderr)
-    else:
-        print(line, file=sys.stderr)
-
-
-def _hold_bars(seconds: float) -> None:
-    """Take the time of compiling out of the progress bars that were open meanwhile."""
-    for bar in _bars():
-        bar.start_t, bar.last_print_t = bar.start_t + seconds, bar.last_print_t + seconds
 
 
 def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
@@ -175,7 +134,6 @@ def _kept(function: Function, liberties: set[str]) -> Function:
         return cast(Function, made)
     if hooks := _hooks():
         made._cache = hooks[1].MachineCode(function)
-        kernels.append(made)
     else:
         with suppress(
             RuntimeError
