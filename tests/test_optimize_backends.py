@@ -117,26 +117,12 @@ def test_a_solution_is_verified_independently_of_the_solver(dense):
     assert solution.gradient_norm > 0.01
 
 
-def test_osqp_ends_the_same_whatever_it_solved_before(dense):
-    """The workspace of a structure is kept, one per thread; nothing of what it has solved shows."""
-    near, far = (Problem.from_snapshot(dense, step, 0, run=1) for step in (10, 11))
-    osqp.unbounded.cache_clear()
-    first = solve(near, "osqp")
-    solve(far, "osqp")
-    again = solve(near, "osqp")
-    assert osqp.unbounded.cache_info().misses == 1
-    assert np.array_equal(first.x, again.x)
-    assert np.array_equal(first.covariance, again.covariance)
-
-
 def test_osqp_repairs_what_fails_its_kkt_check(dense):
     problem = Problem.from_window(dense, 20, 0, 5)
     loose = {**osqp.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(osqp, "SETTINGS", loose)
-        osqp.unbounded.cache_clear()
         solution = solve(problem, "osqp", throw=False)
-    osqp.unbounded.cache_clear()
     assert solution.extras["repairs"] > 0
 
 

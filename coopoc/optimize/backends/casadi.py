@@ -8,6 +8,7 @@ small problems without inequalities, IPOPT the others and those where FATROP fai
 
 from dataclasses import replace
 from functools import lru_cache
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ def solver(
         )
     methods = ("fatrop", "ipopt") if moving <= FATROP_NUMBERS and np.array_equal(*sides) else ("ipopt",)
     for method in methods:
-        end = _run(form, NlpSolver(programme(form, method, int(max_iterations))), problem, x, sides, tolerance)
+        end = _run(form, programme(form, method, int(max_iterations), get_ident()), problem, x, sides, tolerance)
         if end.extras["return_status"] == SUCCESS:
             break
     return replace(end, extras=end.extras | {"method": method})
@@ -83,7 +84,7 @@ def solver(
 
 def _run(
     form: Structure,
-    nlp: "NlpSolver",
+    nlp: Any,
     problem: Problem,
     x: Floats,
     sides: tuple[Floats, Floats],
@@ -91,11 +92,14 @@ def _run(
 ) -> SolverResult:
     """Solve around x (n, ambient), and for poses again around the answer until it stays."""
     space, free, count, rounds = form.space, form.movable, 0, 0
-    multipliers: Floats = np.zeros(len(sides[0]))
+    multipliers: Any = 0.0
     while rounds < CHART_MOVES:
-        here = np.zeros(int(free.sum())), _numbers(problem, x)
-        at, multipliers, iterations, status = nlp(*here, sides, multipliers)
-        before, step, count, rounds = x, np.zeros(free.shape), count + iterations, rounds + 1
+        end = nlp(p=_numbers(problem, x), lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
+        at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
+        status = stats["return_status"]
+        if isinstance(status, int):  # FATROP has one number for all that is not a success
+            status = SUCCESS if stats["success"] else "Not_Solved"
+        before, step, count, rounds = x, np.zeros(free.shape), count + int(stats["iter_count"]), rounds + 1
         step[free] = at
         if np.isfinite(at).all():
             x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
@@ -130,48 +134,10 @@ def _exponential(step: Floats, dimension: int) -> Floats:
     return np.concatenate([step[:, :dimension], ratio * w], axis=-1)
 
 
-class NlpSolver:
-    """CasADi's nlpsol, whose numbers go in and out by memory that is shared with it.
-
-    Its call makes a matrix of every number and output: of 770 us for a star of ten, 100. Each has a memory of its own.
-
-    Args:
-        solver: the nlpsol.
-    """
-
-    def __init__(self, solver: Any) -> None:
-        self._buffer, self._evaluate = solver.buffer()
-        self._given: dict[str, Any] = {name: np.zeros(solver.nnz_in(i)) for i, name in enumerate(solver.name_in())}
-        self._found: dict[str, Any] = {name: np.zeros(solver.nnz_out(i)) for i, name in enumerate(solver.name_out())}
-        for i, array in enumerate(self._given.values()):
-            self._buffer.set_arg(i, memoryview(array))
-        for i, array in enumerate(self._found.values()):
-            self._buffer.set_res(i, memoryview(array))
-        self._given["lbx"][:], self._given["ubx"][:] = -np.inf, np.inf
-
-    def __call__(self, x: Floats, p: Floats, sides: tuple[Floats, Floats], multipliers: Floats) -> tuple[Any, ...]:
-        """x and the multipliers where it ends, iterations and status; x is NaN where nothing could be evaluated.
-
-        Args:
-            x: start.
-            p: parameters.
-            sides: lower and upper of the constraints.
-            multipliers: of them, at the start.
-        """
-        for name, value in (("x0", x), ("p", p), ("lbg", sides[0]), ("ubg", sides[1]), ("lam_g0", multipliers)):
-            self._given[name][:] = value
-        self._found["x"][:] = np.nan
-        self._evaluate()
-        stats = self._buffer.stats()
-        status = stats["return_status"]
-        if isinstance(status, int):  # FATROP has one number for all that is not a success
-            status = SUCCESS if stats["success"] else "Not_Solved"
-        return self._found["x"].copy(), self._found["lam_g"].copy(), int(stats["iter_count"]), status
-
-
 @lru_cache(maxsize=64)
-def programme(structure: Structure, method: str, max_iterations: int) -> Any:
-    """CasADi's nlpsol of a structure by "fatrop" or "ipopt", kept for the next problems that share it."""
+def programme(structure: Structure, method: str, max_iterations: int, thread: int) -> Any:
+    """CasADi's nlpsol of a structure by "fatrop" or "ipopt", its own for each thread, kept for the next problems that
+    share it."""
     import casadi as ca
 
     symbols, scale = expressions(structure), ca.SX.sym("scale")

@@ -1,4 +1,4 @@
-"""osqp: sequential quadratic programming with one workspace per structure, whose values are updated at every step.
+"""osqp: sequential quadratic programming with one workspace per solve, whose values are updated at every step.
 
 Bounds on positions and displacements are rows l - h <= C dx <= u - h of each quadratic programme, with one C. The start
 is first moved onto them by the least step; from then on every step keeps them, so that the cost alone decides between
@@ -6,13 +6,10 @@ steps.
 
 Settings matter: OSQP reports "solved" and can be a metre off when odometry weighs 5e5 times as much as GNSS. Scaling is
 off, the tolerance is tight, and every answer is checked against its own KKT conditions and repaired where it fails.
-Without constraints over-relaxation is off too (alpha = 1: an iteration is then a proximal step with the weight sigma,
-and 1.6 would make 40 of them out of one), and a repair is further iterations. With them rho adapts, and a repair solves
-exactly for the active set that the iterations have found (polishing).
+Over-relaxation is off too: without constraints an iteration is then a proximal step with the weight sigma, and 1.6
+would make 40 of them out of one. A repair solves exactly for the active set that the iterations have found (polishing).
 """
 
-from functools import lru_cache
-from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -26,29 +23,19 @@ from ..model.problem import Problem
 
 SETTINGS = {
     "scaling": 0,
-    "rho": 1e-4,
+    "rho": 0.1,
     "alpha": 1.0,
     "sigma": 1e-6,
-    "eps_abs": 1e-12,
-    "eps_rel": 1e-12,
-    "max_iter": 200,
-    "check_termination": 1,
-    "polishing": False,
-    "adaptive_rho": 0,
-    "warm_starting": True,
-    "verbose": False,
-}
-BOUNDED = {
-    "rho": 0.1,
-    "alpha": 1.6,
     "eps_abs": 1e-9,
     "eps_rel": 1e-9,
     "max_iter": 4000,
-    "check_termination": 10,
+    "check_termination": 1,
+    "polishing": False,
     "polish_refine_iter": 10,
     "adaptive_rho": 1,
+    "warm_starting": True,
+    "verbose": False,
 }
-"""Settings that change under constraints."""
 NEGLIGIBLE = 1e-11
 """m, an error of a coordinate that no tolerance asks to be smaller."""
 BOUND_TOLERANCE = 1e-9
@@ -78,8 +65,7 @@ def solver(
     array([1., 8.])
     """
     system, layout, held = sparse(problem), layout_of(problem), bool(problem.constraints)
-    programme = _bounded(problem, layout) if held else unbounded(layout, get_ident())
-    programme.counts.update(osqp_iterations=0, repairs=0)
+    programme = _programme(problem, layout)
     if held:
         try:
             x, feasible = _nearest(problem, x)
@@ -152,13 +138,10 @@ class Programme:
 
         if self._workspace is None:
             self._workspace, self._pattern.data = osqp.OSQP(), values
-            settings = {**SETTINGS, **(BOUNDED if len(lower) else {})}
-            self._workspace.setup(self._pattern, q, self._rows, lower, upper, **settings)
+            self._workspace.setup(self._pattern, q, self._rows, lower, upper, **SETTINGS)
             return
         self._polish(False)
         self._workspace.update(Px=values, q=q, l=lower, u=upper)
-        if not len(lower):  # the workspace is kept: earlier solves must not show
-            self._workspace.warm_start(x=np.zeros(len(q)))
 
     def _polish(self, wanted: bool) -> None:
         """Whether OSQP solves for its active set exactly; without one it would print a message."""
@@ -181,23 +164,15 @@ class Programme:
         return bool(np.all(kept & pushed))
 
 
-def _bounded(problem: Problem, layout: Layout) -> Programme:
+def _programme(problem: Problem, layout: Layout) -> Programme:
     """The programme of a problem with its constraints, which are linear."""
     from scipy.sparse import csc_matrix
 
-    rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
-    return Programme(_pattern(layout), csc_matrix(rows.matrix)[:, layout.entries.number.ravel() >= 0])
-
-
-@lru_cache(maxsize=64)
-def unbounded(layout: Layout, thread: int) -> Programme:
-    """The programme without bounds of a structure, its workspace set up once, its own for each thread."""
-    from scipy.sparse import csc_matrix
-
-    pattern, size = _pattern(layout), layout.entries.size
-    programme = Programme(pattern, csc_matrix((0, size)))
-    programme.update(pattern.data, np.zeros(size), np.empty(0), np.empty(0))
-    return programme
+    matrix: Any = csc_matrix((0, layout.entries.size))
+    if problem.constraints:
+        rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
+        matrix = csc_matrix(rows.matrix)[:, layout.entries.number.ravel() >= 0]
+    return Programme(_pattern(layout), matrix)
 
 
 def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
