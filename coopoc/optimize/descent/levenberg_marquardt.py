@@ -40,8 +40,6 @@ ROUNDED_SHARE = 1e-18
 the step that is taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
-SLOW_RATIO = 0.2
-"""A predicted decrease above this share of the one before is evidence against J^T J, too: it converges slowly."""
 HESSIAN_SHARE = 1e-3
 """Share of the cost from which on the exact Hessian makes the last steps."""
 HIDDEN_STEPS = 12
@@ -78,13 +76,13 @@ def arrive(
     """Minimise by Levenberg-Marquardt from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by
     the geometry.
 
-    H = J^T J, until two gain ratios were off by more than a fifth, or two predicted decreases hardly fell, or the end
-    is near, by HESSIAN_SHARE; then the exact Hessian, with which the last steps converge quadratically however large
-    the residuals are. Where that is not positive definite J^T J takes over for some steps. mu is the multiplier of a
-    trust region |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps
-    are `bounded`, the last one is below the tolerance. A `smooth` descent ends with the first
-    step whose gain ratio is not within 1/2 .. 3/2. An undamped step that raises the cost is taken with the next one
-    where both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines.
+    H = J^T J, until two gain ratios were off by more than a fifth, or the end is near, by HESSIAN_SHARE; then the exact
+    Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
+    positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
+    the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps are `bounded`, the last one is below
+    the tolerance. A `smooth` descent ends with the first step whose gain ratio is not within 1/2 .. 3/2. An undamped
+    step that raises the cost is taken with the next one where both lower it by what the first promised: far ends of a
+    long drive turn too far to be moved by straight lines.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3;
@@ -98,7 +96,7 @@ def arrive(
     step = step or factored
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
-    converged, last, still = False, np.inf, 0
+    converged, still = False, 0
     cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
@@ -151,11 +149,10 @@ def arrive(
             if smooth and abs(gain - 1.0) >= NONQUADRATIC:
                 break
             if model == "gauss-newton":
-                off = abs(gain - 1.0) > MISMATCH or (record[-1][1] == 0.0 and predicted > SLOW_RATIO * last)
+                off = abs(gain - 1.0) > MISMATCH
                 against = against + 1 if against < 0 or off else max(against - 1, 0)
                 against = AGAINST if near else against
                 model = "newton" if against >= AGAINST else model
-            last = predicted
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
                 undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
