@@ -1,5 +1,6 @@
 """Array types used in every signature, and checks of values; shapes stand in docstrings as (R, T, N, 3)."""
 
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import fields
@@ -166,6 +167,22 @@ def number(
     return result
 
 
+def runs_in_memory(runs: object, per_run: int) -> int:
+    """A number of runs whose recording takes no more than half of the memory of this machine.
+
+    Args:
+        runs: the number.
+        per_run: numbers of a recording of one run.
+
+    >>> runs_in_memory(10**15, 1000)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    coopoc.errors.InputError: runs = 1000000000000000: must be >= 1 and at most ...
+    """
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
+    hint = "A recording must fit into memory: make several of fewer runs, each with its seed, or take fewer vehicles."
+    return int(number("runs", runs, 1, memory // (16 * max(per_run, 1)), kind=int, allowed=">= 1", hint=hint))
+
+
 def seed_of(value: object) -> int:
     """A seed of random draws."""
     hint = "Any whole number from 0 on will do."
@@ -203,6 +220,19 @@ def robust_std(values: Floats) -> float:
     1.4826
     """
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def check_turns(field: str, angles: Floats) -> None:
+    """InputError for angles (T, ...) rad that jump by more than two turns, as degrees do: a drive's may be unwrapped.
+
+    >>> check_turns("heading", np.array([0.0, 90.0]))
+    Traceback (most recent call last):
+    coopoc.errors.InputError: heading[1] = 90.0: must be in rad, and jump by less than two turns. Convert degrees by \
+np.deg2rad, and wrap what is unwrapped.
+    """
+    jump = np.abs(np.diff(angles, axis=0, prepend=0.0) if angles.ndim else angles) > TWO_TURNS
+    hint = "Convert degrees by np.deg2rad, and wrap what is unwrapped."
+    refuse(field, angles, jump, "must be in rad, and jump by less than two turns", hint)
 
 
 Kind = TypeVar("Kind")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import sys
 import textwrap
@@ -151,8 +152,6 @@ def list_names() -> None:
             )
 
 
-NARROWEST = 40
-"""Columns of a terminal for which help is laid out, at least."""
 OWN: Mapping[str, Command] = {
     "run": run,
     "table": table,
@@ -162,6 +161,8 @@ OWN: Mapping[str, Command] = {
 
 
 def _status(argv: list[str]) -> int:
+    home = os.path.expanduser("~")  # of a quoted path, or one behind "=", which shells leave as it is
+    argv = [re.sub("(^|=)~(?=/|$)", lambda match: match[1] + home, word) for word in argv]
     try:
         if argv[:1] in (["--version"], ["-V"]):
             print(version("coopoc"))
@@ -183,7 +184,7 @@ def _status(argv: list[str]) -> int:
     except BrokenPipeError:  # the reader of stdout has ended, as in: coopoc table FOLDER | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         print(f"coopoc: {error}", file=sys.stderr)
         return 1
 
@@ -202,7 +203,7 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
         print(_settings(rest[0]))
     if isinstance(loaded, Mapping):
         return _dispatch(loaded, rest, f"{prog} {name}")
-    os.environ["COLUMNS"] = str(max(get_terminal_size().columns, NARROWEST))
+    os.environ["COLUMNS"] = str(max(get_terminal_size().columns, 40))  # help is laid out for 40 columns at least
     return int(tyro.cli(loaded, prog=f"{prog} {name}", args=rest, config=(FlagCreatePairsOff,)) or 0)
 
 

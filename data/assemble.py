@@ -10,13 +10,11 @@ from coopoc.arrays import Bools, Floats, Ints
 
 SAME_INSTANT = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
-MIN_SPEED, MAX_SPEED = 2e-3, 500.0
+MIN_TYPICAL_SPEED, MAX_TYPICAL_SPEED = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
 REGION = 2.0
 """Degrees that a fleet spans at most; robots that stand in a room, and tremble in motion capture, are metres apart."""
-LATEST = 1e11
-"""s since 1970, the year 5138."""
-CELLS, PER_ROW = 500_000, 200
+MIN_INSTANTS, MAX_INSTANTS_PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 PLANE_STD = 0.01
 """m and rad: how well z = 0, and with it an inclination of pi/2, is known where heights were not measured."""
@@ -185,18 +183,18 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, south), (east, north) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
     near = max(east - west, north - south) < REGION
-    if 0 < speed < MIN_SPEED and near and max(-west, east) <= 360 and max(-south, north) <= 180:
+    if 0 < speed < MIN_TYPICAL_SPEED and near and max(-west, east) <= 360 and max(-south, north) <= 180:
         raise InputError(
             f"{file}: columns x, y",
             f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}",
             "look like degrees, must be metres in a local frame",
             "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.",
         )
-    if speed > MAX_SPEED:
+    if speed > MAX_TYPICAL_SPEED:
         raise InputError(
             f"{file}: columns t, x, y, z",
             f"a typical speed of {speed:.4g} m/s",
-            f"must be below {MAX_SPEED:g} m/s",
+            f"must be below {MAX_TYPICAL_SPEED:g} m/s",
             "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "
             "vehicles share an id, or pass any_scale=True.",
         )
@@ -207,7 +205,7 @@ def check_time(t: Floats, file: str, column: str = "t") -> None:
 
     >>> check_time(np.array([1.7e9]), "drive.csv")
     """
-    late = t[np.abs(t) > LATEST]
+    late = t[np.abs(t) > 1e11]  # the year 5138
     if len(late):
         raise InputError(
             f"{file}: column {column}",
@@ -222,11 +220,11 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
 
     >>> check_size(3.0, 2, 6, 0.1, "drive.csv")
     """
-    if not steps * vehicles <= max(CELLS, PER_ROW * rows):
+    if not steps * vehicles <= max(MIN_INSTANTS, MAX_INSTANTS_PER_ROW * rows):
         raise InputError(
             f"{file}: column t with dt = {dt:g} s",
             f"{steps:.3g} steps of {vehicles} vehicles for {rows} rows",
-            f"must be at most {PER_ROW} instants a row",
+            f"must be at most {MAX_INSTANTS_PER_ROW} instants a row",
             "Check that t is in seconds (not nanoseconds or milliseconds), or take a longer dt.",
         )
 

@@ -15,14 +15,14 @@ from coopoc.errors import InputError, MissingLibraryError, said, unknown
 from .cells import numeric
 from .log.units import Rows, Summary, of_kinds
 
-TURN = "orientation.x orientation.y orientation.z orientation.w"
+ORIENTATION = "orientation.x orientation.y orientation.z orientation.w"
 POSE = "pose.position.x pose.position.y pose.position.z pose.orientation.x pose.orientation.y pose.orientation.z \
 pose.orientation.w"
 READ = {
     "sensor_msgs/msg/NavSatFix": "fix latitude longitude altitude status.status position_covariance_type \
 position_covariance",
     "nav_msgs/msg/Odometry": "odometry twist.twist.linear.x twist.twist.angular.z twist.covariance",
-    "sensor_msgs/msg/Imu": f"imu angular_velocity.z angular_velocity_covariance {TURN} orientation_covariance",
+    "sensor_msgs/msg/Imu": f"imu angular_velocity.z angular_velocity_covariance {ORIENTATION} orientation_covariance",
     "geometry_msgs/msg/PoseStamped": f"pose {POSE}",
     "sensor_msgs/msg/Range": "range range min_range max_range",
 }
@@ -203,7 +203,7 @@ def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd
     """A topic that was written as a table, a column per field of the message, as a wide table of a log."""
     frame = frame.rename(columns=_field)
     t = sum(unit * numeric(frame, name, file) for name, unit in STAMPS.items() if name in frame)
-    known = {*FIELDS, *UNMEASURED, "status.status", "position_covariance_type", *TURN.split()}
+    known = {*FIELDS, *UNMEASURED, "status.status", "position_covariance_type", *ORIENTATION.split()}
     if true:
         known.update(POSE.split(), POSE.replace("pose.", "pose.pose.").split())
     topic = {name: numeric(frame, name, file) for name in frame if name in known}
@@ -225,7 +225,7 @@ def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> p
     summary.refuse(reason, int((~valid).sum()), where)
     topic = topic[valid]
     made = {"t": topic["t"]} | {kind: topic[name] for name, kind in FIELDS.items() if name in topic}
-    turn = (POSE if true else TURN).split()[-4:]
+    turn = (POSE if true else ORIENTATION).split()[-4:]
     if {*turn} <= {*topic}:
         made["heading"] = _yaw(*(topic[axis] for axis in turn))
     for name, kind in UNMEASURED.items():

@@ -2,11 +2,14 @@
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import tyro
 
 from coopoc import InputError, plot_recording, plot_track
+from coopoc.arrays import one_of
+from coopoc.paths import replaceable, write
 
 from .fetch import TIMEOUT, Entry, fetch, public
 from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, load_log
@@ -106,6 +109,8 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
 
     from .log.check import check as checked
 
+    out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
+    one_of("ending of --picture", replaceable(out).suffix, (".png", ".pdf", ".svg", ".jpg"))
     log = load_log(path)
     print(log.summary)
     try:
@@ -123,9 +128,9 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
         print(f"check: {warning.replace(f': {log.summary.columns}.', ', as listed above.')}")
     for what in result.unseen:
         print(f"not seen: {what}")
-    out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
     drawn = plot_recording(result.log.recording, step=0)
-    plot_track(result.track, drawn, fleet=result.log.truth).figure.canvas.print_figure(out)
+    figure = plot_track(result.track, drawn, fleet=result.log.truth).figure
+    write(out, partial(figure.savefig, format=out.suffix[1:]))
     print(f"picture: {out}", file=sys.stderr)
 
 

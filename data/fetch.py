@@ -20,8 +20,6 @@ from coopoc.workers import progress_bar
 
 TIMEOUT = 20.0
 """s without a byte, after which a server is given up."""
-CHUNK = 1 << 16
-"""Bytes that are read at once."""
 ARCHIVE = "archive.zip"
 """Name under which an archive is shown while it is fetched."""
 
@@ -228,7 +226,7 @@ def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float)
     try:
         bar = progress_bar(desc=to.name, total=size, unit="B", unit_scale=True, delay=2.0)
         with urllib.request.urlopen(address, timeout=timeout) as answer, bar:
-            while len(data) <= size and (chunk := answer.read(CHUNK)):
+            while len(data) <= size and (chunk := answer.read(65536)):
                 data += chunk
                 bar.update(len(chunk))
             rest = getattr(answer, "length", 0) or 0

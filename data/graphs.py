@@ -14,7 +14,7 @@ from coopoc.world.links import wrap
 
 from .log.units import Rows, Summary, of_kinds
 
-FLAT, EVERY = 1e-3, 0.1
+MIN_STD, SAMPLE = 1e-3, 0.1
 """m/s and rad/s, least noise of odometry, and s from one sample of it to the next."""
 
 
@@ -52,11 +52,11 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
             names[place] = robot
         turn, stamps = wrap(edges.orientation[index, 0]), graph.stamps[places]
         moved, lasts = turned(np.pad(edges.position[index], ((0, 0), (0, 1))), -0.5 * turn)[:, 0], np.diff(stamps)
-        t = np.arange(stamps[0] + EVERY, stamps[-1], EVERY)  # steps half of it before are there, and have a truth
+        t = np.arange(stamps[0] + SAMPLE, stamps[-1], SAMPLE)  # steps half of it before are there, and have a truth
         for kind, k, each in (("speed", 0, moved), ("yaw_rate", 2, turn)):
-            rate = np.diff(np.interp(t, stamps, np.append(0.0, np.cumsum(each)))) / EVERY
-            std = np.sqrt(np.mean(edges.covariance[index, k, k][lasts > 0] / lasts[lasts > 0]) / EVERY)
-            parts.append({"t": t[1:] - EVERY / 2, "vehicle": robot, kind: rate, f"{kind}_std": max(std, FLAT)})
+            rate = np.diff(np.interp(t, stamps, np.append(0.0, np.cumsum(each)))) / SAMPLE
+            std = np.sqrt(np.mean(edges.covariance[index, k, k][lasts > 0] / lasts[lasts > 0]) / SAMPLE)
+            parts.append({"t": t[1:] - SAMPLE / 2, "vehicle": robot, kind: rate, f"{kind}_std": max(std, MIN_STD)})
     who, position = np.array(names, dtype=object), graph.position
     one, other = who[ranges.nodes.T]
     measured = {"range": ranges.distance, "range_std": np.sqrt(ranges.variance)}

@@ -10,7 +10,8 @@ import pandas as pd
 from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
 from coopoc.formats.values import MAX_NUMBER, read_table, read_words
-from coopoc.text import given_path, short_repr
+from coopoc.paths import given_path
+from coopoc.text import short_repr
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
 
@@ -23,7 +24,7 @@ MAX_GAP = 0.5
 TURN = 2 * np.pi + 1e-6
 LAGS = np.arange(0.0, 0.525, 0.025)
 """s, that are tried."""
-WINDOW = 5.0
+ERROR_SECONDS = 5.0
 """s, over which errors are summed. Of 1, 2, 5, 10, 20 and 30 s it makes the true poses of the first 300 s of set 6 most
 likely (docs/real.md)."""
 LASTING_SECONDS = 60.0
@@ -194,10 +195,10 @@ def surveyed(log: MrclamLog) -> Floats:
 def calibrate(log: MrclamLog, until: float) -> Calibration:
     """Calibration on the first `until` seconds.
 
-    The lag minimises the residual of the turn rate; scales and slip are least squares, per robot, over sums of WINDOW:
-    of single steps they would be too small, because the robots follow their commands gradually. Errors that last are
-    noise whose sums grow faster than those of white noise, n s^2: the s here is that of the sums over WINDOW, of the
-    odometry's errors, and of those of all that a robot measures in that time.
+    The lag minimises the residual of the turn rate; scales and slip are least squares, per robot, over sums of
+    ERROR_SECONDS: of single steps they would be too small, because the robots follow their commands gradually. The sums
+    of time-correlated errors grow faster than those of white noise, n s^2: the s here is that of the sums over
+    ERROR_SECONDS, of the odometry's errors, and of those of all that a robot measures in that time.
 
     Args:
         log: of read_mrclam.
@@ -209,12 +210,12 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     Source: the variance of batch means, Conway, Some tactical problems in digital simulation, Man. Sci. 10(1), 1963.
     """
     dt = log.fleet.dt
-    first, window = slice(1, int(until / dt)), int(WINDOW / dt)
-    if not 10 * WINDOW <= until < log.fleet.t[-1]:
+    first, window = slice(1, int(until / dt)), int(ERROR_SECONDS / dt)
+    if not 10 * ERROR_SECONDS <= until < log.fleet.t[-1]:
         raise InputError(
             "calibrate_s",
             f"{until:g} s",
-            f"must be {10 * WINDOW:g} s or more and end before the log, {log.fleet.t[-1]:g} s",
+            f"must be {10 * ERROR_SECONDS:g} s or more and end before the log, {log.fleet.t[-1]:g} s",
             "Leave a part to score.",
         )
     velocity = turned(log.fleet.velocity, -midway(log.heading))[first]
@@ -268,7 +269,7 @@ def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = np.
     """Standard deviation of white noise whose sums over what a robot measures in a window are as large as those of the
     errors (M,), those beyond a gate of robust standard deviations aside."""
     inlier = np.abs(error - np.median(error)) <= gate * robust_std(error)
-    group = np.unique(observer[inlier] * 10**6 + np.floor(t[inlier] / WINDOW), return_inverse=True)[1]
+    group = np.unique(observer[inlier] * 10**6 + np.floor(t[inlier] / ERROR_SECONDS), return_inverse=True)[1]
     sums = np.bincount(group, error[inlier])
     return float(np.sqrt((sums**2).sum() / inlier.sum()))
 

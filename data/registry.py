@@ -181,7 +181,7 @@ def kind_of(name_or_path: str | Path) -> str:
     ''
     """
     name, options = split(name_or_path)
-    if name in DATASETS or not Path(name).exists():
+    if name in DATASETS or not (Path(name).is_file() or Path(name).is_dir()):
         return ""
     return str(options.get("format") or detect(Path(name), options.get("columns")))
 
@@ -242,7 +242,7 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
     for name in options:
         if name not in accepted:
             raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
-    if not path.exists():
+    if not (path.is_file() or path.is_dir()):
         raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
     return read(path, **options)
 

@@ -12,12 +12,12 @@ import numpy as np
 
 from coopoc import Fleet, InputError, Recording
 from coopoc.errors import suggestion
+from coopoc.paths import given_path
 from coopoc.plugins import in_file, names
-from coopoc.text import given_path
 
 from .fetch import bring, local
 
-ROUNDING = 1e-9
+STEP_ROUNDING = 1e-9
 """Share of a step by which a time may miss one."""
 
 
@@ -33,7 +33,7 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     >>> split("drive.csv?dt=0.1&columns=t:time,id:car")
     ('drive.csv', {'dt': 0.1, 'columns': {'t': 'time', 'id': 'car'}})
     """
-    text = name_or_path if isinstance(name_or_path, str) else str(given_path(name_or_path))
+    text = os.path.expanduser(name_or_path if isinstance(name_or_path, str) else given_path(name_or_path))
     name, mark, query = text.partition("?")
     given_path(name)
     if os.path.exists(text):
@@ -87,7 +87,7 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
     if since is None and until is None:
         return data
     begin, end, t = since or 0.0, np.inf if until is None else until, data.t
-    first, last = np.searchsorted(t - t[0], np.array([begin, end]) - ROUNDING * (t[1] - t[0])).tolist()
+    first, last = np.searchsorted(t - t[0], np.array([begin, end]) - STEP_ROUNDING * (t[1] - t[0])).tolist()
     if not (last - first >= 2 and 0 <= begin < end):
         actual, length = f"since {begin:g} s until {end:g} s", f"{t[-1] - t[0]:g} s"
         raise InputError(

@@ -22,7 +22,7 @@ from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.learned.checkpoint import Checkpoint, load
 from coopoc.learned.nets.gain_net import GainNet, Memory
-from coopoc.text import given_path, replaceable
+from coopoc.paths import given_path, replaceable
 from coopoc.world.sensors import stream
 
 INPUTS = (*Memory._fields, "gnss", "velocity", "dt")

@@ -1,7 +1,6 @@
 """Checkpoints: weights in safetensors with a card and a checksum, written atomically, refused if they do not fit."""
 
 import json
-import os
 import platform
 import warnings
 from collections.abc import Mapping
@@ -15,18 +14,18 @@ import safetensors
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from coopoc import paths
 from coopoc.arrays import check_fields, instance, named, number
 from coopoc.errors import InputError, shown
 from coopoc.formats.seals import UNSEALED, holds, sealed
+from coopoc.paths import given_path
 from coopoc.plugins import find, in_file, path_of, points
-from coopoc.text import given_path, replaceable, short_repr
+from coopoc.text import short_repr
 
 from .nets.gain import Gain
 from .nets.stack import unflatten
 
 _HISTORY, CHECKSUM = "history", "checksum"
-MADE_WITH = ("coopoc", "torch", "numpy")
-"""What a card has the versions of, beside Python's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,7 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     """
     path, model = given_path(path), instance("checkpoint", checkpoint, Checkpoint).model
     card = dict(checkpoint.card) | {
-        "environment": {"python": platform.python_version()} | {name: version(name) for name in MADE_WITH},
+        "environment": {"python": platform.python_version()} | {n: version(n) for n in ("coopoc", "torch", "numpy")},
         "kind": kind(model),
         "net": dict(model.settings),
         "parameters": sum(p.numel() for p in model.parameters()),
@@ -94,10 +93,7 @@ def write(path: Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any]) ->
     except (TypeError, ValueError, RecursionError) as error:
         allowed = f"must hold what JSON can ({error})"
         raise InputError("card", shown(card), allowed, "Convert its values to numbers, texts and lists.") from None
-    replaceable(path).parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_bytes(sealed(to_bytes(dict(tensors), metadata={"card": text})))
-    os.replace(partial, path)
+    paths.write(path, sealed(to_bytes(dict(tensors), metadata={"card": text})))
 
 
 def kind(model: Gain) -> str:

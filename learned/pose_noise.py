@@ -16,7 +16,7 @@ LEARNED = "velocity_std_ratio velocity_floor yaw_rate_std range_std azimuth_std 
 """Numbers of Sensors that are learned where they are positive."""
 MAX_STDS = {"velocity_std_ratio": 1.0, "speed_scale_std": 1.0, **dict.fromkeys(ANGULAR, np.pi)}
 """What Sensors allow: above it a measurement means nothing, and the score is flat."""
-STEP = 0.5
+SIMPLEX_STEP = 0.5
 """Of the first simplex, in logarithms."""
 
 
@@ -85,6 +85,6 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
         ]
         return -float(np.mean(scores))
 
-    simplex = np.vstack([first, first + STEP * np.eye(len(first))])
+    simplex = np.vstack([first, first + SIMPLEX_STEP * np.eye(len(first))])
     optimum = minimize(loss, first, method="Nelder-Mead", options={"maxfev": evaluations, "initial_simplex": simplex})
     return sensors(optimum.x)

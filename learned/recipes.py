@@ -11,8 +11,8 @@ import torch
 from coopoc import InputError, Method, Outliers, Sensors
 from coopoc.arrays import check_fields, instance
 from coopoc.errors import unknown
+from coopoc.paths import given_path
 from coopoc.plugins import file_digest, find, in_file
-from coopoc.text import given_path
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import load

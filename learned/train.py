@@ -14,8 +14,8 @@ import torch
 
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import listed, number
+from coopoc.paths import given_path, made_folder
 from coopoc.plugins import in_file
-from coopoc.text import given_path, made_folder
 from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 

@@ -18,6 +18,7 @@ from coopoc.arrays import seed_of
 from coopoc.errors import said, unknown
 from coopoc.evaluate.scores import causal, scored
 from coopoc.methods.catalogue import needs_whole_fleet
+from coopoc.paths import write
 from coopoc.plugins import find, in_file
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
@@ -101,7 +102,7 @@ def benchmark(
         began, file = time.perf_counter(), card_file(name, out, seed, validation)
         made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
-        file.write_text(json.dumps(made, indent=1) + "\n")
+        write(file, json.dumps(made, indent=1) + "\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
         print(page([made]))
     if table:

@@ -10,10 +10,10 @@ import numpy as np
 from coopoc import InputError, Study
 from coopoc.arrays import Floats, one_of, refuse
 from coopoc.errors import unknown
+from coopoc.paths import given_path
 from coopoc.plugins import called, find, in_file, names
 from coopoc.study.study import Params, Row
 from coopoc.study.style import NOT_CAUSAL
-from coopoc.text import given_path
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 

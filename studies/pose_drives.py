@@ -24,7 +24,7 @@ from coopoc.world.storage import digest
 
 LONGEST_CALIBRATION, CALIBRATION_SHARE = 300.0, 0.4
 """s, and share of the drive, that calibrate where the settings leave it open."""
-BLOCK, BLOCKS = 30.0, 4
+BLOCK_SECONDS, MIN_BLOCKS = 30.0, 4
 """s of a block of time, and the least number of blocks, where the settings leave it open."""
 
 POSES: Mapping[str, Mapping[str, Any]] = {
@@ -35,7 +35,7 @@ POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
 }
 """Pose filters by name: their options."""
-GATE = 5.0
+GATE_STDS = 5.0
 """Standard deviations, of all pose filters."""
 
 
@@ -121,7 +121,7 @@ def _mrclam(folder: Path) -> Source:
 
     def drive(until: float, v2x: V2X) -> Drive:
         recording = under(pose_recording(log, calibration(until)), v2x, logged=False)
-        return Drive(recording, pose_start(recording, gate=GATE), log.fleet, True)
+        return Drive(recording, pose_start(recording, gate=GATE_STDS), log.fleet, True)
 
     text = "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     counts, digests = (len(log.fleet.ids), len(surveyed(log))), {"log": hashed(folder)}
@@ -173,7 +173,7 @@ def left(p: Params) -> float:
 
 def block(p: Params) -> float:
     """s of a block of time, which errors are averaged over: set, else 30 s, a quarter of the rest at most."""
-    return min(BLOCK, left(p) / BLOCKS) if p["block_s"] is None else float(p["block_s"])
+    return min(BLOCK_SECONDS, left(p) / MIN_BLOCKS) if p["block_s"] is None else float(p["block_s"])
 
 
 def hashed(*paths: Path) -> str:

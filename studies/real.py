@@ -32,7 +32,7 @@ BASE = {"method": FLEET}
 """The filter that is run with neighbours and without, with the noise as it is assumed."""
 EVERY = (*METHODS, *TRAINED)
 LANDMARKS, NEIGHBOURS = (0, 1, 2, 4, 15), (0, 1, 2, 3, 4)
-TRAINING, SETTLED = (1, 4, 15), 30.0
+TRAINING, UNTIL_THINNED = (1, 4, 15), 30.0
 """Landmarks of the drives that noise is learned on, and s until they are thinned, a tenth of that part at most."""
 
 
@@ -45,7 +45,7 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
 
     source = drives.source(data)
     alone = source.drive(until, near(0))
-    steps, settled = (int(s / alone.recording.dt) for s in (until, min(SETTLED, until / 10)))
+    steps, settled = (int(s / alone.recording.dt) for s in (until, min(UNTIL_THINNED, until / 10)))
     assert alone.truth is not None
     first, truth = alone.recording.between(0, steps), alone.truth.between(0, steps)
 

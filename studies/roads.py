@@ -21,7 +21,7 @@ from .tasks import blocks_of, located, planar, rounded
 BEGIN_SHARE, BLOCK_SECONDS = 0.4, 30.0
 """Share of a drive before what is scored, free for training; s of a block, a quarter of the rest at most, over which
 errors are averaged."""
-EVERY, OUTAGE, PERIOD = 10, 30.0, 180.0
+FIX_EVERY, OUTAGE_SECONDS, PERIOD_SECONDS = 10, 30.0, 180.0
 """One fix in so many is kept, and none in the last s of every period of s."""
 ROADS: Mapping[str, tuple[str, ...]] = {
     "f9k": ("ublox_f9k.nmea", "span_truth.gga"),
@@ -32,7 +32,7 @@ ROADS: Mapping[str, tuple[str, ...]] = {
 PUBLISHED: Mapping[str, tuple[str, ...]] = {"nclt": ("test.pt",), "nclt-val": ("val.pt",)}
 """Task of drives that a net was published with -> the file, which is scored with all its fixes and steps."""
 EVERY_ROAD = {**ROADS, **PUBLISHED}
-STEP = 0.1
+COMMA_STEP = 0.1
 """s, of comma2k19, whose speeds come every 0.01 s."""
 
 
@@ -65,17 +65,17 @@ def seen(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         recording, truth = _kitti(*map(np.loadtxt, files))
     else:
         if files:
-            log = read_log(files[0], **({"truth": files[1]} if files[1:] else {"dt": STEP}))
+            log = read_log(files[0], **({"truth": files[1]} if files[1:] else {"dt": COMMA_STEP}))
         else:
             log = load_log(str(data))
         if log.truth is None:
             raise InputError("data", str(data), "must hold a truth", 'Name its file: "LOG?truth=FILE".')
         recording, truth = log.recording, log.truth
-    clock, gnss = (recording.t - recording.t[0]) % PERIOD, recording.gnss.copy()
+    clock, gnss = (recording.t - recording.t[0]) % PERIOD_SECONDS, recording.gnss.copy()
     for column in range(len(recording.ids)):
-        kept = np.flatnonzero(np.isfinite(gnss[0, :, column, 0]))[::EVERY]
+        kept = np.flatnonzero(np.isfinite(gnss[0, :, column, 0]))[::FIX_EVERY]
         starts = [start for start, _ in recording.stretches(column)]
-        gone = np.setdiff1d(np.arange(len(clock)), [*kept[clock[kept] < PERIOD - OUTAGE], *starts])
+        gone = np.setdiff1d(np.arange(len(clock)), [*kept[clock[kept] < PERIOD_SECONDS - OUTAGE_SECONDS], *starts])
         gnss[:, gone, column] = np.nan
     return replace(recording, gnss=gnss), truth
 

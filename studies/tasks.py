@@ -37,7 +37,7 @@ from coopoc.study.study import Row
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
-from .pose_drives import GATE, POSES, hashed
+from .pose_drives import GATE_STDS, POSES, hashed
 
 VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
@@ -118,10 +118,6 @@ def recording(task: Task, everyone: bool, remove_outliers: bool = False) -> tupl
     return observed, fleet
 
 
-BOUND_RUNS = 3
-"""Runs over which the bound of many vehicles is averaged where it depends on them: each takes half a minute."""
-
-
 @lru_cache(maxsize=64)
 def bound(task: Task, information: str) -> float:
     """RT-LE m of the bound over an ideal channel, root mean square over the egos: no method is below it.
@@ -134,7 +130,7 @@ def bound(task: Task, information: str) -> float:
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
     clean: Recording | None = None
     if sensors.outliers or task.attack.share:
-        runs = BOUND_RUNS if information in ("past", "fleet") else task.runs
+        runs = 3 if information in ("past", "fleet") else task.runs  # each takes half a minute
         clean, _ = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)
     if information == "fleet":
         bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, list(task.columns)], 1, 0)]
@@ -187,7 +183,7 @@ def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any
         assert log.truth is not None
         start = int(0.4 * len(log.recording.t))
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
-        begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE)
+        begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE_STDS)
         return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
     drive = pose_drives.source(str(path)).drive(0.0, V2X(max_neighbours=3, radius=float("inf")))
     if drive.truth is None or drive.truth.heading is None:
@@ -208,7 +204,7 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     path = located(folder, file)
     recording, fleet, start, assumed = seen(task, path)
     if isinstance(made, str):
-        made = PoseFilter(**{"lasting": task != "uwb", **assumed, **POSES[made]}, gate=GATE)
+        made = PoseFilter(**{"lasting": task != "uwb", **assumed, **POSES[made]}, gate=GATE_STDS)
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in assumed.items() if name in own})  # type: ignore[type-var]

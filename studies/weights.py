@@ -30,14 +30,14 @@ PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
 LEARNED = (*PAPER, "fedokf")
 """Methods that are trained."""
-WORST = 1.1
+WORST_RATIO = 1.1
 """Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""
 
 
 def seeds(p: Params) -> range:
     """Training seeds of a study with a trained method."""
-    hint = "Each seed trains once."
-    return range(number("train_seeds", p["train_seeds"], 1, kind=int, allowed=">= 1 for a trained method", hint=hint))
+    allowed = ">= 1 for a trained method"
+    return range(number("train_seeds", p["train_seeds"], 1, 1000, kind=int, allowed=allowed, hint="Each trains once."))
 
 
 def trainable(p: Params) -> bool:
@@ -192,7 +192,7 @@ def train(
     find("coopoc.recipes", recipe)  # before torch is loaded
     from coopoc.learned.train import train_all
 
-    worst = math.inf if worse else WORST
+    worst = math.inf if worse else WORST_RATIO
     made = train_all(drives(data), out, seeds=[seed], recipes=[recipe], aggregate=aggregate, worst=worst)
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")

@@ -16,13 +16,13 @@ from coopoc import InputError, Method, nees, rt_le
 from coopoc.arrays import number
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
+from coopoc.paths import made_folder, write
 from coopoc.plugins import file_digest, in_file
 from coopoc.study.cell import Cell
 from coopoc.study.compute import compute
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 from coopoc.study.study import Params, Row
-from coopoc.text import made_folder
 from coopoc.workers import progress_bar
 
 from .lineup import named_method
@@ -39,9 +39,8 @@ WORSE_RATIO = 1.1
 """Ratio of errors from which on a method is worse."""
 BAND = special.chdtri(3, [0.975, 0.025])
 """In which 95 % of the NEES of a consistent filter are, of three degrees of freedom."""
-EXACT = 1e-9
+MIN_RATIO = 1e-9
 """Least ratio that counts in a geometric mean."""
-WORST = 10
 NUMBERS = ("noted", "rt_le_m", "joint_m", "alone_m", "nees_inside", "nees_median", "microseconds_per_step")
 """Columns of a world, which are NaN but for the first where a method failed."""
 NONE = "nothing wrong"
@@ -106,7 +105,7 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
     for name in methods:
         began, file = time.perf_counter(), card_file(name, out, seed, validation)
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
-        file.write_text(card_text(cards[-1]))
+        write(file, card_text(cards[-1]))
         print(details(cards[-1]), end="\n\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
     print(overview(cards))
@@ -196,7 +195,7 @@ def summary(found: "pd.DataFrame") -> dict[str, Any]:
     made["worse_unnoted"] = _interval(100.0 * (worse & (found["noted"] == 0.0)))
     if len(sound):
         for key in ("over_joint", "over_better"):
-            made[key] = [_short(float(np.exp(value))) for value in _interval(np.log(sound[key].clip(EXACT)))]
+            made[key] = [_short(float(np.exp(value))) for value in _interval(np.log(sound[key].clip(MIN_RATIO)))]
     made["percentile_95"] = _short(float(np.quantile(found["over_better"], 0.95, method="higher")))
     if len(inside := found["nees_inside"].dropna()):
         made |= {"nees_inside": _interval(inside), "nees_median": _short(float(found["nees_median"].median()))}
@@ -221,7 +220,7 @@ def _worst(name: str, split: Split, found: "pd.DataFrame") -> list[Row]:
             "text": world(one["seed"], split).text,
             "command": f"coopoc benchmark {name} --worlds 1 --seed {one['seed']}{more}",
         }
-        for one in found.sort_values("over_better", ascending=False, kind="stable").head(WORST).to_dict("records")
+        for one in found.sort_values("over_better", ascending=False, kind="stable").head(10).to_dict("records")
     ]
 
 

@@ -69,6 +69,9 @@ MISTAKES = (
     ("run error_cdf --tracks tum", "tracks = error_cdf: has cells without estimates"),
     ("reference nowhere", "folder = nowhere: holds no manifest.json"),
     ("table nowhere", "folder = nowhere: holds no views.json"),
+    ("solve drive.g2o --output drive.g2o", "ending of --output = '.g2o': must be one of .json"),
+    ("data check drive.csv --picture a.foo", "ending of --picture = '.foo': must be one of .png"),
+    ("data check /dev/zero", "data = /dev/zero: must be the path of a file or folder"),
     ("report", "folders = none"),
 )
 OF_OTHERS = ("greet --name x", "kin greet", "kin --help", "kin gret")

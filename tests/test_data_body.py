@@ -239,6 +239,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     assert set(frame["landmarks"]) == {0, 1}
     assert set(frame.loc[frame["method"] == "trained-centralised", "max_neighbours"]) == {0, 2}
     log = load_log(data)
+    assert real.drives.calibrated(settings | {"calibrate_s": None}) == pytest.approx(0.4 * log.recording.t[-1])
     alone = co.PoseFilter("solo", lasting=True, gate=5.0)(log.recording, list(CARS))
     apart = np.linalg.norm(alone.x[0, 100:150, 1] - np.pad(drives()["blue"][0][100:150], ((0, 0), (0, 1))), axis=1)
     found = results.select(method="pose-fleet", max_neighbours=0, landmarks=1, ego="blue", run=0)["rt_le_m"]

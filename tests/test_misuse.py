@@ -131,6 +131,8 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         (lambda: fix_innovations(TRACK, OTHER), "ids and times differ from those that were recorded"),
         (lambda: co.Kalman()(RECORDING, iter([0])), "egos = .*must be a sequence"),
         (lambda: co.Kalman()(RECORDING, {*RECORDING.ids}), "egos = .*must be a sequence"),
+        (lambda: co.observe(FLEET, SENSORS, CHANNEL, runs=10**9), r"runs = 1000000000: must be >= 1 and at most \d"),
+        (lambda: co.write_tum("x.tum", [0, 1], np.eye(2, 3), [90, 91]), r"heading\[0\] = 90.0: must be in rad"),
         (lambda: co.Kalman("identity").start().step(np.zeros(3), np.zeros(3), 1e9), r"> 0 and at most 1e\+08"),
     ],
 )

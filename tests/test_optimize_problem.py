@@ -66,6 +66,10 @@ def test_the_noise_model_sets_the_weights(recording):
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))
     x = np.random.default_rng(0).normal(size=(len(nominal.names), 3)) * 30
     assert stated.cost(x) == pytest.approx(nominal.cost(x), rel=1e-12)
+    unsure = replace(recording, motion_variance=np.full(recording.broadcasts.shape, 9.0))
+    more = Problem.from_window(unsure, 20, 0, 3)
+    before, after = (next(f.std for f in each.factors if f.kind == "displacement") for each in (nominal, more))
+    assert after**2 - before**2 == pytest.approx(9.0 * recording.dt)
     identity = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.identity())
     assert {f.kind for f in identity.factors} == {"position", "displacement"}
     assert all((f.std == 1).all() for f in identity.factors)

@@ -114,7 +114,8 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
     )
     assert {"full: 1", "room: 0", "read-only: 2"} <= set(said)
     message = next(line for line in said if "No space left" in line)
-    assert "No space left on device. Finished cells are kept: make room and repeat: 'disk/small/cells/" in message
+    assert "No space left on device. Finished files are kept: make room, or choose another folder" in message
+    assert "disk/small/cells/" in message
     assert "coopoc: out = disk/small: cannot be written (Read-only file system). Choose another --out." in said
     assert any(line.startswith("| Neighbours K") for line in said)
     kept, after = files(tmp_path / "kept"), files(tmp_path / "small")

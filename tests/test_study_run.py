@@ -1,19 +1,28 @@
 """The engine: resume, failures, processes. The study is a real one that is installed as a third party's."""
 
+import errno
+import os
 import shutil
 import sys
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import refused
 from joblib.externals.loky import reusable_executor
 from small_runs import files, numbers, shown
 
-from coopoc.study import store
+import coopoc as co
+from coopoc.cli import _status
 from coopoc.study.compute import WorkerDiedError, compute, schedule
 from coopoc.study.publish import views
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
+from coopoc.world.storage import save_recording
+
+RECORDING = co.observe(co.load_fleet("town10").between(0, 3).select([0, 1]), co.Sensors())
 
 
 def test_two_processes_compute_what_one_computes(study, tmp_path):
@@ -190,18 +199,36 @@ def test_a_cell_runs_on_one_thread(tmp_path):
     assert set(results.frame["threads"]) == {1}
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "kept"
-    store.write(path, "old")
+def learned(path):
+    pytest.importorskip("torch")
+    from coopoc.learned import checkpoint, recipes
 
-    def broken(file):
-        file.write(b"half")  # type: ignore[attr-defined]
-        raise OSError("no space left on device")
+    checkpoint.save(path, checkpoint.load(recipes.shipped_weights()["okf"]))
 
-    with pytest.raises(OSError, match="no space"):
-        store.write(path, broken)
-    assert [p.name for p in tmp_path.iterdir()] == ["kept"]
-    assert path.read_text() == "old"
+
+WRITERS = {
+    "a.tum": lambda path: co.write_tum(path, [0.0, 0.1], np.eye(2, 3)),
+    "a.npz": lambda path: save_recording(RECORDING, path),
+    "a.json": lambda path: _status(["solve", "two.pyfg", "--output", path]),
+    "a.safetensors": learned,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_is_written_whole_or_not_at_all(name, tmp_path, monkeypatch):
+    def full(_file):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    Path("two.pyfg").write_text("VERTEX_XY L0 11 19\nVERTEX_XY L1 11 21\nEDGE_RANGE 0 L0 L1 2 1\n")
+    WRITERS[name](f"~/made/{name}")
+    written = (tmp_path / "made" / name).read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with suppress(OSError):
+        WRITERS[name](f"~/made/{name}")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "made").iterdir()} == {name: written}
+    assert not (tmp_path / "~").exists()
 
 
 def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study, tmp_path):

@@ -23,8 +23,6 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5B
 INK, PALE = "#2B2F36", "#C3CBD6"
 SHARE_95 = 5.991464547107979
 """Quantile of chi-square with two degrees of freedom: squared radius of a 95 % ellipse in standard deviations."""
-NAMED = 30
-"""Nodes of a solution up to which each has its name and its ellipse."""
 
 
 def plot_recording(recording: Recording, ax: "Axes | None" = None, *, run: int = 0, step: int | None = None) -> "Axes":
@@ -119,7 +117,7 @@ def plot_solution(solution: "Solution", ax: "Axes | None" = None, *, problem: "P
     from ..optimize.model.problem import Problem
     from ..optimize.solution import Solution
 
-    few = len(instance("solution", solution, Solution).names) <= NAMED
+    few = len(instance("solution", solution, Solution).names) <= 30
     ax, at = axes(ax), solution.position[:, :2]
     if problem is not None:
         if instance("problem", problem, Problem).names != solution.names:

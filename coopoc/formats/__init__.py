@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from ..errors import InputError, suggestion
+from ..paths import given_path
 from ..plugins import find
-from ..text import given_path
 from .g2o import read_g2o
 from .graph import Graph
 from .pyfg import read_pyfg

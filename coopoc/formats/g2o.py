@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..text import given_path
+from ..paths import given_path
 from .graph import NAME, Graph
 from .records import Grammar, by_tag
 from .values import read_words, to_numbers

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
 from ..text import short_repr
-from .values import MIN_DIAGONAL, UNIT, to_rotation
+from .values import MIN_DIAGONAL, QUATERNION_ROUNDING, to_rotation
 
 ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be
     "pose_prior": ("pose",),
@@ -24,7 +24,7 @@ ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge m
     "ranges": ("any", "any"),
 }
 NAME = re.compile(r"[A-Za-z](0|[1-9][0-9]{0,16})")
-ROUNDING = 1e-9
+MATRIX_ROUNDING = 1e-9
 """What may be left below zero, or unequal, of the largest eigenvalue or entry."""
 Location = Callable[[str, int], str]
 
@@ -324,7 +324,7 @@ def _values(edges: Edges, field: str, location: Location) -> None:
         if name == "covariance":
             covariance: Floats = getattr(edges, name)
             eigenvalues = np.linalg.eigvalsh(covariance)
-            least = ROUNDING * np.maximum(eigenvalues[:, -1], 0)
+            least = MATRIX_ROUNDING * np.maximum(eigenvalues[:, -1], 0)
             uneven = np.abs(covariance - covariance.swapaxes(-1, -2)).max(axis=(-2, -1))
             wrong, hint = (eigenvalues[:, 0] < -least) | (uneven > least), "Order of the upper triangle: by rows."
             _refuse(location, field, wrong, covariance, "must be symmetric and positive semi-definite", hint, actual)
@@ -332,8 +332,11 @@ def _values(edges: Edges, field: str, location: Location) -> None:
 
 def _unit(orientation: Floats, field: str, location: Location) -> None:
     if orientation.shape[-1] == 4:
-        off = np.abs(np.linalg.norm(orientation, axis=1) - 1) > UNIT
-        allowed, hint = f"must have length 1 to within {UNIT:g}", "Order is qx qy qz qw; 0 0 0 1 is no rotation."
+        off = np.abs(np.linalg.norm(orientation, axis=1) - 1) > QUATERNION_ROUNDING
+        allowed, hint = (
+            f"must have length 1 to within {QUATERNION_ROUNDING:g}",
+            "Order is qx qy qz qw; 0 0 0 1 is no rotation.",
+        )
         _refuse(location, field, off, orientation, allowed, hint, "quaternion ")
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ..text import given_path
+from ..paths import given_path
 from .graph import ENDS, NAME, Graph
 from .records import Grammar, by_tag
 from .values import read_words

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked
+from ..arrays import Floats, check_turns, checked
 from ..errors import InputError
-from ..text import given_path, replaceable
-from .values import UNIT, read_table, to_orientation, to_rotation
+from ..paths import given_path, write
+from .values import QUATERNION_ROUNDING, read_table, to_orientation, to_rotation
 
 
 class Trajectory(NamedTuple):
@@ -56,12 +56,12 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     path = given_path(path)
     lines, table = read_table(path, "t x y z qx qy qz qw")
-    off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > UNIT)
+    off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > QUATERNION_ROUNDING)
     if len(off):
         raise InputError(
             f"{path.name}: line {lines[off[0]]}",
             f"quaternion {table[off[0], 4:].tolist()}",
-            f"must have length 1 to within {UNIT:g}",
+            f"must have length 1 to within {QUATERNION_ROUNDING:g}",
             "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
         )
     _check_order(table[:, 0], lambda row: f"{path.name}: line {lines[row]}")
@@ -74,13 +74,13 @@ def write_tum(
     """Write a path as a TUM file, `t x y z qx qy qz qw` by rows, which evo and most SLAM tools read.
 
     Args:
-        path: of the file, which is replaced.
+        path: of the file, which is replaced whole; its folder is made.
         t: (T,) s, increasing.
         position: (T, 3) m, such as `track.x[run, :, k]` of the k-th ego.
         heading: (T,) rad from +x, anticlockwise; None where it is unknown: all poses then point along +x.
 
     Raises:
-        InputError: shapes, numbers that are not finite, stamps that do not increase.
+        InputError: shapes, numbers that are not finite, stamps that do not increase, headings in degrees.
 
     Source: the tools of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
 
@@ -97,6 +97,8 @@ def write_tum(
     if len(bad):
         raise InputError(f"pose {bad[0]}", poses[bad[0]], "must be finite numbers", "Remove the pose.")
     _check_order(stamps, "pose {}".format)
+    check_turns("heading", course)
     rotation = np.tile(np.eye(3), (len(where), 1, 1))
     rotation[:, :2, :2] = to_rotation(course[:, None])
-    np.savetxt(replaceable(given_path(path)), np.column_stack([stamps, where, to_orientation(rotation)]), fmt="%.9f")
+    rows = np.column_stack([stamps, where, to_orientation(rotation)])
+    write(given_path(path), lambda file: np.savetxt(file, rows, fmt="%.9f"))

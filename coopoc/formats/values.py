@@ -12,7 +12,7 @@ MAX_NUMBER = 1e100
 """Numbers beyond it are none that was measured, and their squares overflow."""
 MIN_DIAGONAL = 1e-100
 """Least entry of a diagonal, and one over the largest: products of what is beyond them leave the range of numbers."""
-UNIT = 1e-2
+QUATERNION_ROUNDING = 1e-2
 """|norm - 1| of a quaternion that was merely rounded (to three decimals); more is not a rotation."""
 
 

@@ -22,9 +22,9 @@ FIRST_FILTER = 6
 """Which of them holds before anything was seen."""
 REMEMBERS = 30.0
 """s, in which what filters have predicted is forgotten."""
-PRIOR = 6.0
+PRIOR_COUNT = 6.0
 """Numbers that R, as it is stated, counts as."""
-TINY = 1e-12
+MIN_VARIANCE = 1e-12
 """m^2, least R."""
 CLIP_STDS = 3.0
 """Standard deviations at which an innovation is clipped."""
@@ -52,7 +52,7 @@ def constant_velocity(
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
     p, score = np.zeros((models, 3)), np.zeros((models, 3))
     v, best = np.zeros(3), FIRST_FILTER
-    score[:, 0], score[:, 1] = PRIOR, PRIOR * variance
+    score[:, 0], score[:, 1] = PRIOR_COUNT, PRIOR_COUNT * variance
     for j in range(count):
         dt = t[j] - t[j - 1] if j > 0 else math.inf
         if dt > gap:
@@ -73,7 +73,7 @@ def constant_velocity(
                 v[c] = fixes[j, c] - x[m, c]
                 square += v[c] * v[c]
             numbers, squares, logs = score[m]
-            limit = 3.0 * CLIP_STDS**2 * max(squares / numbers, TINY) * s
+            limit = 3.0 * CLIP_STDS**2 * max(squares / numbers, MIN_VARIANCE) * s
             clip = math.sqrt(limit / square) if square > limit else 1.0
             for c in range(3):
                 x[m, c] += clip * a / s * v[c]
@@ -82,7 +82,7 @@ def constant_velocity(
             numbers, squares = keep * numbers + 3.0, keep * squares + min(square, limit) / s
             logs = keep * logs + 3.0 * math.log(s)
             score[m, 0], score[m, 1], score[m, 2] = numbers, squares, logs
-            likely = -0.5 * (numbers * math.log(max(squares / numbers, TINY)) + logs)
+            likely = -0.5 * (numbers * math.log(max(squares / numbers, MIN_VARIANCE)) + logs)
             if likely > most:
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):

@@ -31,7 +31,7 @@ CENTRE = (
     "on nothing"
 )
 NOT_CAUSAL = "not causal: every estimate depends on the whole drive"
-MIN_ANGLE_DISTANCE = 0.1
+MIN_ANGLE_STDS = 0.1
 """Share of a range's standard deviation: angles are no more certain than at this distance, whatever the sensors'
 `min_range`. In one place they would weigh so much that all digits are lost."""
 STIFF = 1e-5
@@ -119,7 +119,7 @@ def drive_problem(
     (step, column), link, (fix, motion) = np.nonzero(active), np.flatnonzero(counts), stds
     sensors = model.sensors
     if sensors is not None:
-        sensors = replace(sensors, min_range=max(sensors.min_range, MIN_ANGLE_DISTANCE * sensors.relative_std[0]))
+        sensors = replace(sensors, min_range=max(sensors.min_range, MIN_ANGLE_STDS * sensors.relative_std[0]))
     relative = recording.usable_relative[run, link]
     stds = fix, np.maximum(motion, STIFF * fix.min())
     factors = drive_factors(recording, run, (step, column), link, relative, stds, sensors)

@@ -10,7 +10,7 @@ from ..world.links import stretches
 from ..world.recording import Recording
 from .noise_model import NoiseModel
 
-SECOND = 1.0
+JUDGED_SECONDS = 1.0
 """s between two fixes that are judged together, at least; twice that between two numbers of a neighbour."""
 DOUBTS = (
     "fixes, {}: far from its estimates; it is lost, or rejects them",
@@ -63,7 +63,8 @@ def doubts(
     egos, claimed = np.asarray(columns, dtype=np.int64), cov if cov is not None and stated else np.zeros((0,) * 5)
     fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
     fix[1] = fix[1].sum()
-    every, marks = max(min(round(SECOND / recording.dt), steps // TOGETHER), 1), np.zeros((3, len(egos), steps), int)
+    every = max(min(round(JUDGED_SECONDS / recording.dt), steps // TOGETHER), 1)
+    marks = np.zeros((3, len(egos), steps), int)
     turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
     motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
     fixes = np.stack(np.broadcast_arrays(recording.fix_scale**2 * fix[0], fix[1]), axis=2)

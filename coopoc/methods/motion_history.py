@@ -68,7 +68,7 @@ class MotionHistory:
         self, row: Floats, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float
     ) -> None:
         """Write fix, velocity, dt and age of the fix to the input of a kernel; InputError as `check`."""
-        simple = isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN
+        simple = isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= UNCHECKED
         try:
             if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
                 self.check(gnss, velocity, dt, fix_age)
@@ -82,7 +82,7 @@ class MotionHistory:
 
 LARGEST = (MAX_POSITION,) * 3 + (MAX_SPEED,) * 3 + (MAX_POSITION,) * 2
 """Of fix m, velocity m/s, dt and age s."""
-PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
+UNCHECKED = frozenset({list, tuple, np.ndarray, type(None)})
 """What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
 
 

@@ -37,8 +37,7 @@ from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_o
 from .motion_history import MotionHistory, fix_or_none, relative_vector, seconds, three
 from .noise_model import constant_noise, motion_noise
 
-FIRST = np.zeros(1, np.int64)
-KNOWN = 0.01
+START_VARIANCE = 0.01
 """m^2, of a start that is known, as it is sent."""
 
 
@@ -74,7 +73,7 @@ class RelativeMeasurement:
             raise InputError("id", shown(self.id), "must be a name", 'Give for example "b".')
         relative = relative_vector(self.relative)
         row[:AGE], row[AGE] = (
-            components(drop_steep_azimuths(relative)[None, None], FIRST)[0, 0],
+            components(drop_steep_azimuths(relative)[None, None], np.zeros(1, np.int64))[0, 0],
             seconds("age", self.age),
         )
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
@@ -159,7 +158,7 @@ class StarStream:
         self._memory: Floats = np.zeros(9)
         self._odometry: Floats = new_state(self._motion) if priors.fix_gate else np.empty(0)
         if x0 is not None:
-            self._memory[:6] = *self._start, *np.full(3, 1.0 / KNOWN)
+            self._memory[:6] = *self._start, *np.full(3, 1.0 / START_VARIANCE)
 
     @property
     def neighbours(self) -> dict[str, Floats]:

@@ -15,7 +15,7 @@ from .model.problem import Problem
 Options: TypeAlias = dict[str, Any]
 MAX_ITERATIONS = 500
 """About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
-STEP_TOLERANCE = 1e-8
+SOLVER_STEP_TOLERANCE = 1e-8
 """m or rad, largest move of a node in the last step."""
 
 
@@ -99,7 +99,7 @@ class Backend:
             if name not in allowed:
                 hint = suggestion(name, allowed, "Leave it out.")
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
-        most, tolerance = options.get("max_iterations", MAX_ITERATIONS), options.get("tolerance", STEP_TOLERANCE)
+        most, tolerance = options.get("max_iterations", MAX_ITERATIONS), options.get("tolerance", SOLVER_STEP_TOLERANCE)
         number("max_iterations", most, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
         number("tolerance", tolerance, TINY, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
         if lacking := self.capabilities.lacking(problem):

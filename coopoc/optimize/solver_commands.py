@@ -12,13 +12,15 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
+from ..arrays import one_of
 from ..errors import InputError, dependencies
 from ..formats import load_graph
+from ..paths import replaceable, write
 from .backend import backends
 from .graph_problems import Objective, Start, from_graph, loop_closures
 from .model.problem import Problem
 from .robust.gnc import solve_gnc
-from .robust.loop_closures import AGREEING
+from .robust.loop_closures import MIN_AGREEING
 from .solution import Solution, Status
 from .solve import solve
 
@@ -55,6 +57,8 @@ def solve_file(
         repair: take the nearest positive definite matrix where a g2o file's information is none.
         covariance: compute marginals of graphs of more than 1,000 nodes, too.
     """
+    if output is not None:
+        one_of("ending of --output", replaceable(output).suffix, (".json",))
     graph = load_graph(file, repair)
     problem = from_graph(graph, objective, "odometry" if outliers else start)
     say(str(problem))
@@ -63,7 +67,7 @@ def solve_file(
     summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
     summary |= {"misfit": (size := None if outliers else misfit(solution))}
     if output is not None:
-        output.write_text(json.dumps(summary | nodes(solution)) + "\n")
+        write(output, json.dumps(summary | nodes(solution)) + "\n")
         say(f"the solution is in {output}")
     print(json.dumps(summary, indent=1))
     if solution.status is not Status.SOLVED:
@@ -71,7 +75,7 @@ def solve_file(
     for note in solution.notes:
         say(note)
     for joint in solution.extras.get("joined", ()):
-        if joint["rival"] >= AGREEING:
+        if joint["rival"] >= MIN_AGREEING:
             say("{body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint))
     if size is not None and not 1 / UNLIKELY_FACTOR < size < UNLIKELY_FACTOR:
         say(f"residuals are {size:.2g} times what the file states. {MISTAKEN}")

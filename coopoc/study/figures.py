@@ -167,7 +167,7 @@ def _where(of: Where) -> Where:
     return {name: value for name, value in of.items() if name not in STYLE}
 
 
-WIDTH = 0.009
+LINE_SHARE = 0.009
 """Share of the height of a panel, a line's width: lines within it of each other are named together."""
 
 
@@ -185,7 +185,7 @@ def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]]) -> None:
     lines = [(of, points) for of, points in lines if of.get("method") != "bound"]
     height = axes.yaxis.get_transform().transform
     heights = [height(np.array([*map(_mean, points.values())])) for _, points in lines]
-    near, groups = WIDTH * np.ptp(height(np.array(axes.get_ylim()))), list[list[int]]()
+    near, groups = LINE_SHARE * np.ptp(height(np.array(axes.get_ylim()))), list[list[int]]()
     for k, (_, points) in enumerate(lines):
         for group in groups:
             same = points.keys() == lines[group[0]][1].keys()

@@ -12,7 +12,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from ..errors import InputError
-from ..text import file_name
+from ..paths import file_name, write
 from . import store
 
 NAME = "manifest.json"
@@ -47,7 +47,7 @@ class Manifest:
             if asdict(replace(before, environment=self.environment)) == stored:
                 used = [before.environment, *used]
         stored["environment"] = environments(used)
-        store.write(folder / NAME, json.dumps(stored, indent=1) + "\n")
+        write(folder / NAME, json.dumps(stored, indent=1) + "\n")
 
 
 def read(folder: Path) -> Manifest:

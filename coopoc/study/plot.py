@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
+from ..paths import write
 from ..text import picture
-from . import store
 from .style import RC, line, look
 
 FIXED: Mapping[str, dict[str, Any]] = {
@@ -44,7 +44,7 @@ class Plot:
                 x, y, width, height = (round(side, 5) for side in axes.get_position(original=True).bounds)
                 axes.set_position((x, y, width, height))
             for suffix, metadata in FIXED.items():
-                store.write(Path(f"{path}.{suffix}"), partial(self.figure.savefig, format=suffix, metadata=metadata))
+                write(Path(f"{path}.{suffix}"), partial(self.figure.savefig, format=suffix, metadata=metadata))
         return self.caption
 
     def _repr_png_(self) -> bytes:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, unknown
-from ..text import file_name, given_path
+from ..paths import file_name, given_path, write
 from ..workers import progress_bar
 from . import store
 from .results import Results
@@ -39,7 +39,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         progress: show a bar on stderr.
     """
     folder = given_path(folder)
-    store.write(folder / "results.parquet", lambda file: results.frame.to_parquet(file, index=False))
+    write(folder / "results.parquet", lambda file: results.frame.to_parquet(file, index=False))
     missing, errors = dict[str, str](), list[Exception]()
 
     def made(name: str, view: Callable[[Results], Any]) -> Any:
@@ -74,7 +74,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         "idle": sorted(made("idle", study.idle) or ()),
         "limitations": list(study.limitations),
     }
-    store.write(folder / VIEWS, json.dumps(stored, indent=1, default=_data, ensure_ascii=False) + "\n")
+    write(folder / VIEWS, json.dumps(stored, indent=1, default=_data, ensure_ascii=False) + "\n")
     if errors and not results.failed:
         raise errors[0]
 

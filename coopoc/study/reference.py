@@ -15,8 +15,8 @@ from tyro.conf import Positional, arg
 
 from ..errors import InputError
 from ..evaluate.statistics import Interval
+from ..paths import given_path, write
 from ..plugins import names
-from ..text import given_path
 from . import store
 from .results import SEED, Results, ego_by_run
 from .study import Params, find_study
@@ -124,7 +124,7 @@ class Reference:
         """Write as JSON, one line per number."""
         lines = ",\n".join("  " + json.dumps(vars(number), default=float) for number in self.numbers)
         head = json.dumps({"study": self.study, "settings": dict(self.settings)}, indent=1, default=list)[:-2]
-        store.write(given_path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
+        write(given_path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
 
     @classmethod
     def load(cls, path: str | Path) -> "Reference":

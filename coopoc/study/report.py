@@ -11,8 +11,8 @@ from markupsafe import Markup, escape
 
 from ..arrays import listed
 from ..errors import InputError
-from ..text import given_path, inside, uncontrolled
-from . import store
+from ..paths import given_path, inside, write
+from ..text import uncontrolled
 from .manifest import environments
 from .publish import views
 from .results import Results
@@ -27,7 +27,6 @@ _MIME = {
     "png": "image/png",
     "svg": "image/svg+xml",
 }
-_LARGEST_SVG = 1_000_000
 
 _TERM = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(TERMS, key=len, reverse=True)))})(?![\w-])")
 
@@ -78,7 +77,7 @@ def report(
         css=Markup((OWN / "report.css").read_text("utf-8")),
         script=Markup((OWN / "report.js").read_text("utf-8")),
     )
-    store.write(out, page)
+    write(out, page)
     return out
 
 
@@ -118,7 +117,7 @@ def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]
             hint = "Repeat coopoc run: it writes the views again."
             raise InputError("folder", str(folder), f"lacks figures/{path.name}", hint)
         content[form] = path.read_bytes()
-    name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= _LARGEST_SVG else "png"
+    name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= 1_000_000 else "png"
     files = [_file(name, form, content[form]) for form in ("pdf", "png")]
     return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
 

@@ -12,7 +12,8 @@ import pyarrow as pa
 from ..arrays import Floats
 from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, mean_interval
-from ..text import given_path, short_repr
+from ..paths import given_path
+from ..text import short_repr
 from . import store
 from .cell import Params
 from .manifest import read

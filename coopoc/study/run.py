@@ -9,7 +9,7 @@ from typing import Any
 from ..arrays import instance, named, number
 from ..errors import InputError
 from ..formats.trajectories import write_tum
-from ..text import given_path
+from ..paths import given_path
 from ..workers import progress_bar
 from ..world.fleet import Fleet
 from ..world.recording import Recording
@@ -173,10 +173,9 @@ def _work(
 def _resolve(study: Study | str, out: str | Path, settings: Params | None) -> tuple[Study, list[Cell], Path]:
     """The study under its settings, its cells, and its folder."""
     resolved = find_study(study) if isinstance(study, str) else instance("study", study, Study)
-    given_path(out)
     changes = named("settings", settings or {}, "Give settings={name: value}.")
     changed = resolved.override({name: _as_path(name, value, out) for name, value in changes.items()})
-    return changed, changed.cells(), Path(out) / changed.name
+    return changed, changed.cells(), given_path(out) / changed.name
 
 
 def _as_path(name: str, value: Any, out: str | Path) -> Any:
@@ -193,7 +192,7 @@ def _as_path(name: str, value: Any, out: str | Path) -> Any:
             pass
         case _:
             return value
-    file = Path(out) / "data" / f"{digest(recording)[:12]}{truth.digest[:8] if truth is not None else ''}.npz"
+    file = given_path(out) / "data" / f"{digest(recording)[:12]}{truth.digest[:8] if truth is not None else ''}.npz"
     if not file.exists():
-        store.write(file, lambda whole: save_recording(recording, whole, truth))
+        save_recording(recording, file, truth)
     return str(file)

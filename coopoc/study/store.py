@@ -1,10 +1,8 @@
 """The folder of a study: one Parquet file per cell, written whole or not at all, with a checksum."""
 
 import json
-import os
-import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -15,7 +13,7 @@ import pyarrow.parquet as pq
 
 from ..errors import InputError
 from ..formats.seals import UNSEALED, holds, sealed
-from ..text import replaceable
+from ..paths import write
 from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
@@ -32,42 +30,6 @@ class Outcome:
     reason: str
     trace: str
     seconds: float
-
-
-def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
-    """Write a file atomically: a temporary neighbour, flushed to disk, then renamed onto `path`.
-
-    A process that is killed in between leaves the old file or none, never half a file. A symbolic link at `path` is
-    replaced, not followed.
-
-    Raises:
-        InputError: a folder or a device at `path`.
-        OSError: a full or read-only disk, with the path.
-    """
-    replaceable(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _write(path, content)
-    except OSError as error:
-        text = f"{error.strerror or error}. Finished cells are kept: make room and repeat"
-        raise OSError(error.errno, text, str(path)) from error
-
-
-def _write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            if callable(content):
-                content(file)
-            else:
-                file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def content(

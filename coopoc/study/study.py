@@ -14,8 +14,8 @@ import numpy as np
 
 from ..arrays import listed, named
 from ..errors import InputError, unknown
+from ..paths import file_name
 from ..plugins import file_digest, find, from_file, in_file
-from ..text import file_name
 from .cell import Cell, Params, Row, Scalar, digest, entries, parse
 from .provenance import code_of
 

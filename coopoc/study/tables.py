@@ -14,6 +14,7 @@ from tabulate import tabulate
 from ..arrays import one_of
 from ..errors import InputError
 from ..evaluate.statistics import Interval
+from ..paths import write
 from ..text import markdown, spreadsheet, tex, visible
 from .numbers import Number, Results, Where, alike
 from .style import METHODS, NOT_CAUSAL, label, title, words
@@ -91,10 +92,9 @@ class Table:
 
     def save(self, path: str | Path) -> str:
         """Write the table in each of FORMATS, path.md and so on, and return caption and notes."""
-        from . import store  # Arrow, which a mistake need not wait for
 
         for form, suffix in FORMATS.items():
-            store.write(Path(f"{path}.{suffix}"), self.render(form))
+            write(Path(f"{path}.{suffix}"), self.render(form))
         return self.words
 
     def to_markdown(self) -> str:

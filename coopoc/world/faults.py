@@ -13,7 +13,7 @@ from .sensors import stream
 
 Pairs = Sequence[tuple[str, str, Ints, Ints]]
 """Observer id, neighbour id, indices of its links, and their steps."""
-PAIRS = 2_000_000
+PAIRS_AT_ONCE = 2_000_000
 """Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
 
 
@@ -138,7 +138,7 @@ def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, fl
         reach: (min_range, radius) m.
     """
     error, done = np.zeros((len(at), 2)), np.zeros(len(at), dtype=bool)
-    at_once = max(1, PAIRS // len(fleet.ids))
+    at_once = max(1, PAIRS_AT_ONCE // len(fleet.ids))
     for first in range(0, len(at), at_once):
         part = slice(first, first + at_once)
         step, observer, neighbour = (side[at[part]] for side in (links.step, links.observer, links.neighbour))

@@ -10,7 +10,7 @@ MAX_POSITION, MAX_SPEED, MAX_YAW_RATE = 1e8, 1e4, 100.0
 square leaves no digits to what stands beside it."""
 UNWRAPPED = 1e6
 """rad, beyond which an unwrapped angle has lost its digits."""
-COARSE = 0.01
+COARSE_SPACING = 0.01
 """m, of the resolution of float32 that matters."""
 
 
@@ -26,7 +26,7 @@ def plausible(field: str, values: Floats, limit: float, hint: str = "Is it in an
     largest = max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None))
     if largest > limit:
         refuse(field, values, np.abs(values) > limit, f"must be within +-{limit:g} in SI units", hint)
-    if (step := float(np.spacing(np.float32(largest)))) > COARSE and limit == MAX_POSITION:
+    if (step := float(np.spacing(np.float32(largest)))) > COARSE_SPACING and limit == MAX_POSITION:
         there = values[np.isfinite(values)]
         rounded = np.full(values.shape, bool((there == there.astype(np.float32)).all() and (there % 1).any()))
         allowed = f"must have more digits than those of float32, which are {step:g} m apart there"

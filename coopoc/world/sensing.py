@@ -6,11 +6,11 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of, seed_of
+from ..arrays import AnyArray, Bools, Floats, Ints, instance, one_of, runs_in_memory, seed_of
 from ..errors import InputError
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
-from .faults import PAIRS, Pairs, wrong_fixes, wrong_odometry, wrong_relative
+from .faults import PAIRS_AT_ONCE, Pairs, wrong_fixes, wrong_odometry, wrong_relative
 from .fleet import Fleet, columns, interval
 from .links import Links, spherical, wrap
 from .recording import Recording, Vehicles
@@ -57,8 +57,8 @@ def observe(
             odometry has no slip.
 
     Raises:
-        InputError: runs < 1, seed < 0, a rate above 1/dt, an unknown observer, an assumed std of zero, another frame,
-            or a landmark that moves.
+        InputError: runs < 1 or more than fit into memory, seed < 0, a rate above 1/dt, an unknown observer, an assumed
+            std of zero, another frame, or a landmark that moves.
 
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
     >>> observe(fleet, Sensors(), V2X(max_neighbours=1), runs=3)
@@ -66,7 +66,6 @@ def observe(
     """
     fleet, sensors = instance("fleet", fleet, Fleet), instance("sensors", sensors, Sensors)
     v2x = V2X.ideal() if v2x is None else instance("v2x", v2x, V2X)
-    runs = number("runs", runs, 1, 2**32, kind=int, allowed=">= 1", hint="Use at least one noise run.")
     seed = seed_of(seed)
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
@@ -74,6 +73,7 @@ def observe(
     assumed = sensors.known() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
     links = find_links(fleet, watching, v2x, sensors.min_range, standing)
+    runs = runs_in_memory(runs, 8 * fleet.present.size + 4 * len(links))
     broadcasts, arrival = schedule(fleet.ids, fleet.t, links, v2x, runs, seed)
     arrival[:, np.isin(links.neighbour, standing)] = -1
     broadcasts[:, standing] = False
@@ -136,7 +136,7 @@ def find_links(
     links = [np.empty((0, 3), dtype=np.int64)]
     vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
     columns, marks = np.setdiff1d(columns, landmarks), np.isin(np.arange(vehicles), landmarks)
-    at_once = max(1, PAIRS // (vehicles * max(1, len(columns))))
+    at_once = max(1, PAIRS_AT_ONCE // (vehicles * max(1, len(columns))))
     for first in range(0, len(fleet.t), at_once) if (v2x.max_neighbours or marks.any()) and len(columns) else ():
         position = fleet.position[first : first + at_once]
         observer, other = _near(position, columns, v2x.radius)

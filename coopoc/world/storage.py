@@ -6,14 +6,14 @@ import math
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
 
 from ..arrays import AnyArray, instance
 from ..errors import InputError, said
-from ..text import given_path
+from ..paths import given_path, write
 from .fleet import Fleet
 from .links import Links
 from .outliers import Fault, Outliers
@@ -46,19 +46,19 @@ MAX_BYTES, MAX_INFLATION = 2**31, 1032
 """Bytes of one unpacked file, and of each of its own: no deflated stream unpacks to more."""
 
 
-def save_recording(recording: Recording, path: str | Path | IO[bytes], truth: Fleet | None = None) -> None:
+def save_recording(recording: Recording, path: str | Path, truth: Fleet | None = None) -> None:
     """Write a recording; the same one gives the same bytes.
 
     Args:
         recording: in any number of runs.
-        path: .npz file, or an open one.
+        path: .npz file, which is replaced whole; its folder is made.
         truth: of the same vehicles at the same steps.
 
     Raises:
         InputError: no recording, a truth of other vehicles or steps, or a path that does not end in .npz.
     """
     instance("recording", recording, Recording)
-    if isinstance(path, str | Path) and given_path(path).suffix != ".npz":
+    if (path := given_path(path)).suffix != ".npz":
         raise InputError("path", str(path), "must end in .npz", "NumPy would append it.")
     if truth is not None:
         truth.require(recording.ids, recording.t)
@@ -70,7 +70,8 @@ def save_recording(recording: Recording, path: str | Path | IO[bytes], truth: Fl
         arrays |= {"truth_position": truth.position, "truth_velocity": truth.velocity}
         if truth.heading is not None:
             arrays["truth_heading"] = truth.heading
-    np.savez_compressed(path, **{WORDS: np.array(json.dumps(words)), **arrays})
+    named = {WORDS: np.array(json.dumps(words)), **arrays}
+    write(path, lambda file: np.savez_compressed(file, **named))
 
 
 def unpacked(path: Path) -> dict[str, AnyArray]:

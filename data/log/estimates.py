@@ -28,15 +28,15 @@ MOVED_STDS = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 LEAST_CORRELATION = 0.97
 """Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
-ALONE = 0.02
+MIN_OWN_SHARE = 0.02
 """Share of a cause, squared, that no others may make up, so that it can be told from them."""
-OUTLYING, BLOCKS = 5.0, 10
+OUTLYING, DRIVE_PARTS = 5.0, 10
 """Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
 LONG_LAG = 2.0
 """s, from which a lag is looked for, not estimated."""
 LONGEST_LAG, LAG_STEP = 60.0, 0.1
 """s, of lags that are looked for, and from one to the next."""
-VARIED, NUDGE = 0.15, 0.01
+STEADY_SPEED_RATIO, NUDGE_STEP = 0.15, 0.01
 """Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
 are moved to see what a filter makes of an arm."""
 
@@ -83,11 +83,11 @@ def factors(
         return factor
 
     every = np.arange(len(y))
-    value, *without = map(fitted, [every, *(np.setdiff1d(every, part) for part in np.array_split(every, BLOCKS))])
+    value, *without = map(fitted, [every, *(np.setdiff1d(every, part) for part in np.array_split(every, DRIVE_PARTS))])
     before, left = (np.median(np.abs(gap)) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
+    error = np.sqrt(DRIVE_PARTS - 1.0) * np.std(without, axis=0)
     return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
 
 
@@ -105,15 +105,15 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
     velocity = plane(rec.velocity[0] if truth is None else truth.velocity)
     speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
     course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
-    ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
+    ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > STEADY_SPEED_RATIO * speed.mean())
     made = np.stack([ahead, 1j * ahead, velocity])
     if truth is not None:
         return plane(rec.gnss[0] - truth.position), made, made
     then = np.nan_to_num(following(c, made, axis=1))
-    for k, cause in enumerate(np.nan_to_num(NUDGE * made)):
+    for k, cause in enumerate(np.nan_to_num(NUDGE_STEP * made)):
         gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
         moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
-        made[k] = plane(moved.fix - c.fix) / NUDGE
+        made[k] = plane(moved.fix - c.fix) / NUDGE_STEP
     return plane(c.fix), made, then
 
 
@@ -225,13 +225,13 @@ def odometry(c: Check, column: int) -> Estimate:
 def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Estimate:
     """Factors (5,) by which causes x (K, M), a size, a turn, a lag and what else may be, explain y (M,), and a constant
     velocity that is made of `constant` (M,). What is within two standard errors is left out, the constant first, and
-    what looks like another cause, which make up all but ALONE of it, as a lag does on a bend at one speed."""
+    what looks like another cause, which make up all but MIN_OWN_SHARE of it, as a lag does on a bend at one speed."""
     value, error = np.zeros(5), np.full(5, np.inf)
     for causes, extra in ((np.concatenate([x, [constant, 1j * constant]]), [-2, -1]), (x, [2]), (x[:2], [])):
         unit = np.concatenate([causes.real, causes.imag], axis=1)
         unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
         alone = 1.0 / np.diag(np.linalg.inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
-        if extra and (alone < ALONE).any():
+        if extra and (alone < MIN_OWN_SHARE).any():
             continue
         found = factors(y, causes.T, noise)
         if np.linalg.norm(found.value[extra]) >= 2.0 * np.linalg.norm(found.error[extra]):
@@ -316,8 +316,8 @@ def median(values: Floats) -> tuple[float, float]:
     """Median, and its standard error by the medians of parts of the drive; infinite of too few."""
     if len(values) < LEAST_COUNT:
         return 0.0, np.inf
-    parts = [np.median(part) for part in np.array_split(values, BLOCKS)]
-    return float(np.median(values)), float(np.std(parts) / np.sqrt(BLOCKS - 1.0))
+    parts = [np.median(part) for part in np.array_split(values, DRIVE_PARTS)]
+    return float(np.median(values)), float(np.std(parts) / np.sqrt(DRIVE_PARTS - 1.0))
 
 
 def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
@@ -420,7 +420,7 @@ def worst(c: Check, column: int) -> tuple[float | None, float]:
     square, stated = np.square(c.x - c.log.truth.position)[:, column, :size], c.variance[:, column, :size]
     stated = np.where(np.isfinite(square), stated, np.nan)
     ratios = dict[float, float]()
-    for part in np.array_split(np.arange(len(t)), BLOCKS):
+    for part in np.array_split(np.arange(len(t)), DRIVE_PARTS):
         all_of = np.nansum(stated[part])
         if all_of > 0:
             ratios[float(t[part[0]] - t[0])] = float(np.sqrt(np.nansum(square[part]) / all_of))

@@ -14,7 +14,7 @@ from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD, SAME_INSTANT, covered, planar_recording, steps_of
 
-STEP, STARTS = 0.1, 4
+FILTER_STEP, FIRST_DIRECTIONS = 0.1, 4
 """s, of the steps of the pose filters that find a heading, and directions from which they do."""
 PER_SAMPLE, MOST_STEPS = 20, 100_000
 """Steps for each sample of a yaw rate, and in all, beyond which they are longer."""
@@ -165,11 +165,11 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
 
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     """Times (M,) s and headings (M,) rad, NaN until one is SURE, of the pose filter whose innovations are the least
-    until then, of those that begin in STARTS directions; their variances (M,) rad^2; and the least sums (2,) of squared
-    innovations over their variances, with the yaw rates and with those of the other sign."""
+    until then, of those that begin in FIRST_DIRECTIONS directions; their variances (M,) rad^2; and the least sums (2,)
+    of squared innovations over their variances, with the yaw rates and with those of the other sign."""
     fixes, speed, rate, std, walk = way
-    span = max(float(rate.t[-1] - fixes.t[0]), STEP)
-    dt = max(STEP, span / min(PER_SAMPLE * len(rate.t), MOST_STEPS))
+    span = max(float(rate.t[-1] - fixes.t[0]), FILTER_STEP)
+    dt = max(FILTER_STEP, span / min(PER_SAMPLE * len(rate.t), MOST_STEPS))
     t = np.arange(fixes.t[0], fixes.t[0] + span + dt, dt)
     sensors = Sensors(
         gnss_std=(std, std, PLANE_STD),
@@ -183,20 +183,20 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     step = steps_of(fixes.t - t[0], dt, len(t))
     gnss = np.full_like(rec.gnss, np.nan)
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
-    runs = np.arange(2 * STARTS)
+    runs = np.arange(2 * FIRST_DIRECTIONS)
     rec = replace(rec, gnss=gnss).of_runs(0 * runs)
     assert rec.body is not None
-    sign = np.where(runs < STARTS, 1.0, -1.0)[:, None, None]
+    sign = np.where(runs < FIRST_DIRECTIONS, 1.0, -1.0)[:, None, None]
     rec = replace(rec, body=replace(rec.body, yaw_rate=sign * rec.body.yaw_rate))
-    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs, [0, 0, 0, 2 * np.pi / STARTS])
-    spread = std, std, PLANE_STD, np.pi / STARTS
+    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs, [0, 0, 0, 2 * np.pi / FIRST_DIRECTIONS])
+    spread = std, std, PLANE_STD, np.pi / FIRST_DIRECTIONS
     track = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
     assert track.covariance is not None
     assert track.heading is not None
     assert track.heading_covariance is not None
     known = 2.0 * std**2 + np.trace(track.covariance[:, :, 0, :2, :2], axis1=2, axis2=3)
     sums = np.nancumsum(np.square(fix_innovations(track, rec)[:, :, 0]).sum(axis=-1) / known, axis=1)
-    best = sums[:STARTS].argmin(axis=0), np.arange(len(t))
+    best = sums[:FIRST_DIRECTIONS].argmin(axis=0), np.arange(len(t))
     heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
     known = np.maximum.accumulate(variance < SURE**2)
     return t, np.where(known, heading, np.nan), variance, sums[:, -1].reshape(2, -1).min(axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc import V2X, Links, Recording, Sensors
-from coopoc.arrays import Bools, Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints, runs_in_memory
 from coopoc.world.links import spherical, wrap
 from coopoc.world.sensing import schedule
 
@@ -16,7 +16,7 @@ from .units import Rows, Summary, in_group, only, stated_std
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
 PAIR = ["step", "observer", "neighbour"]
-NEAR_RATIO, APART = 10.0, 4.0
+NEAR_MOTIONS, NEAR_STDS = 10.0, 4.0
 """Distances, over what the two move until the step, and over the standard deviation of a fix, below both of which a
 direction is not known well enough."""
 RADAR = "{} ranges beside a direction count for who measured them alone: a radar's partner does not know them"
@@ -96,6 +96,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     if logged:
         return recording
     if v2x.loss > 0 and recording.runs == 1:
+        runs = runs_in_memory(runs, 8 * recording.broadcasts.size + 4 * len(fewer))
         recording = recording.of_runs(np.zeros(runs, dtype=np.int64))
     broadcasts, arrival = schedule(recording.ids, recording.t, fewer, v2x, recording.runs, seed)
     broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
@@ -151,7 +152,7 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     table = table[~again]
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
     std = stated_std(fixes, "x", "y")
-    moved, vague, full = _to_step(table, members, steps, APART * (std if std > 0.0 else Sensors().gnss_std[0]))
+    moved, vague, full = _to_step(table, members, steps, NEAR_STDS * (std if std > 0.0 else Sensors().gnss_std[0]))
     summary.refuse("relative measurements off the steps, of what is too near", table[vague])
     summary.refuse("relative measurements at the most that is measured, of what is further away", table[full])
     kept: pd.DataFrame = table.assign(value=moved).loc[~vague & ~full, [*PAIR, "component", "value"]]
@@ -187,7 +188,7 @@ def _to_step(
 ) -> tuple[Floats, Bools, Bools]:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
-    their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_RATIO times
+    their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_MOTIONS times
     lag du. Nothing is moved where g or du is not known. In body frames a bearing grows by lag w, too, with the
     observer's yaw rate w. And which are as long as the longest range, where most of these fall short of g by more
     than `std`.
@@ -216,6 +217,6 @@ def _to_step(
     full = (component == 0) & (value == value[component == 0].max(initial=0.0))
     full &= full.any() and np.median(np.nan_to_num(away - value)[full]) > std
     gap, moved = np.minimum(away, distance), np.linalg.norm(now - then, axis=1)
-    vague = (gap <= NEAR_RATIO * moved) & (gap <= std)
+    vague = (gap <= NEAR_MOTIONS * moved) & (gap <= std)
     value = value + np.where(vague, 0.0, np.nan_to_num(change[np.arange(len(change)), component]))
     return np.where(component == 1, wrap(value), value), vague, full

@@ -13,7 +13,8 @@ from scipy.interpolate import Akima1DInterpolator
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Floats, checked, instance, named, number, one_of, refuse, texts
 from coopoc.errors import suggestion
-from coopoc.text import given_path, short_repr
+from coopoc.paths import given_path
+from coopoc.text import short_repr
 from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED
@@ -64,7 +65,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
 entry."""
 TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 """Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
-COARSE = 0.5
+SPARSE_SECONDS = 0.5
 """s between samples of a truth, from which lines between them are no way that was driven, and within which of one the
 curve through them is."""
 DRIVES_APART = 3600.0
@@ -485,9 +486,11 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             if len(t) > 1:
                 gap = longest_gap(t, recording.dt, max_gap)
                 out[:] = interpolate(t - steps[0], value, steps - steps[0], gap)
-                if np.median(np.diff(t)) > COARSE and len(t) > 2:
-                    summary.assume(f"a seldom truth counts within {COARSE:g} s, on a curve through all (Akima's)")
-                    near = covered(t, steps, 0.0, COARSE)[:, None] & np.isfinite(out)
+                if np.median(np.diff(t)) > SPARSE_SECONDS and len(t) > 2:
+                    summary.assume(
+                        f"a seldom truth counts within {SPARSE_SECONDS:g} s, on a curve through all (Akima's)"
+                    )
+                    near = covered(t, steps, 0.0, SPARSE_SECONDS)[:, None] & np.isfinite(out)
                     out[:] = np.where(near, Akima1DInterpolator(t - steps[0], value)(steps - steps[0]), np.nan)
             elif len(t) and not first:
                 out[:] = value[0]

@@ -16,7 +16,7 @@ from .residuals import Check, plane
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE_RATIO, NARROW_RATIO = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
-COARSE, EXACT = 0.5, 1e-3
+MAX_ANGLE_STD, MIN_STD_SHARE = 0.5, 1e-3
 """rad: no sensor's angles scatter as much about positions that are better known; least share of a stated deviation that
 is offered, as to numbers without noise."""
 HINTS = {
@@ -28,7 +28,7 @@ HINTS = {
 """What to look for where measurements of a kind miss the positions."""
 OUTLIER_SHARE, LEAST_OUTLIERS = 0.01, 3
 """Share of measurements beyond 5 standard deviations that is reported, if these are more than several."""
-WINDOW = 9
+MEDIAN_WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
 WRONG_SHARE, NAMED_CASES = 0.8, 4
 """Share of a part of a drive in which something is wrong, and of the drive that such a part may be; cases that a
@@ -44,7 +44,7 @@ def measurements(c: Check) -> list[dict[str, Any]]:
         if not len(pair) or np.ptp(c.log.recording.relative[0, pair.index, k]) == 0:
             continue
         known = pair.map({name: offset for name, offset, _ in _named(c, k, stated)}).fillna(0.0)
-        usual = residual.groupby(pair).transform(lambda each: each.rolling(WINDOW, 1, center=True).median())
+        usual = residual.groupby(pair).transform(lambda each: each.rolling(MEDIAN_WINDOW, 1, center=True).median())
         off = (residual - usual).to_numpy()  # errors of the filters last longer than that window
         noise = robust_std(off)
         least = np.maximum(max(noise, 0.2 * stated), expected / 2)  # a direction of what is near hardly counts
@@ -87,7 +87,7 @@ def of_measurements(c: Check) -> list[str]:
         hint = HINTS[name]
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = max(should**2 - least**2, 0.0) ** 0.5
-        wrong = std > WIDE_RATIO * should or (name == "azimuth" and std > COARSE > 3 * position)
+        wrong = std > WIDE_RATIO * should or (name == "azimuth" and std > MAX_ANGLE_STD > 3 * position)
         scaled = False
         if name != "range":
             wrong |= abs(median) > 3 * should
@@ -138,7 +138,7 @@ def of_measurements(c: Check) -> list[str]:
                 + (f"offset={offsets_text} takes it off." if word == "range" else "offset= takes it off.")
             )
         if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):
-            size, std_of = ("less", max(noise, EXACT * least)) if noise < least else ("more", noise)
+            size, std_of = ("less", max(noise, MIN_STD_SHARE * least)) if noise < least else ("more", noise)
             unstated = name in "".join(c.log.summary.assumed.get(UNSTATED, ()))
             known, hint = ("assumed", "") if unstated else ("stated", " Were variances given as deviations?")
             sentences.append(
@@ -158,8 +158,8 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
-        errors = pd.Series(np.abs(wrap(less) if k else less) / expected).rolling(WINDOW, 1, center=True)
-        bad = np.flatnonzero(errors.median() > OUTLYING)  # most of WINDOW are too large
+        errors = pd.Series(np.abs(wrap(less) if k else less) / expected).rolling(MEDIAN_WINDOW, 1, center=True)
+        bad = np.flatnonzero(errors.median() > OUTLYING)  # most of MEDIAN_WINDOW are too large
         if len(bad) < LEAST_COUNT:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
@@ -208,6 +208,6 @@ def _other_angle(c: Check) -> str:
 
 def when(t: Floats, bad: Ints) -> str:
     """The part of a drive with samples at t (M,) s that holds those which are bad, if it is one, in words."""
-    if len(bad) < WINDOW or len(bad) < WRONG_SHARE * (bad[-1] - bad[0]) or len(bad) > WRONG_SHARE * len(t):
+    if len(bad) < MEDIAN_WINDOW or len(bad) < WRONG_SHARE * (bad[-1] - bad[0]) or len(bad) > WRONG_SHARE * len(t):
         return ""
     return f" from {t[bad[0]]:.3g} to {t[bad[-1]]:.3g} s"

@@ -17,7 +17,7 @@ from .read import Log
 
 TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 """m and rad, of first poses that the truth gives."""
-GATE = 5.0
+GATE_STDS = 5.0
 """Of the pose filters that check a log: standard deviations beyond which a measurement is left out."""
 
 
@@ -119,7 +119,7 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...], str]:
     if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
         return None, SPREAD, ""
     try:
-        return pose_start(rec, gate=GATE), SPREAD, ""
+        return pose_start(rec, gate=GATE_STDS), SPREAD, ""
     except InputError:
         if truth is None or truth.heading is None:
             raise
@@ -153,7 +153,7 @@ def filtered(log: Log) -> Check:
         track = Kalman(robust=False)(rec, followed)
     else:
         begin, spread, start = begin_of(log)
-        track = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)(rec, _moving(rec))
+        track = PoseFilter("solo", gate=GATE_STDS, begin=begin, spread=spread)(rec, _moving(rec))
     columns, squares = list(track.egos), normalised_innovations(track, rec)
     assert squares is not None
     assert track.covariance is not None

@@ -24,7 +24,7 @@ from coopoc.learned.engine.layers import (
 from coopoc.learned.engine.optimiser import Moments, Outcome, Update, advance_row
 from coopoc.learned.engine.tile import Index, apart
 
-TRAINED = 4
+DRIVES_AT_ONCE = 4
 """Drives of which one tape holds all steps: so few that the second cache holds it."""
 PRODUCT = 64
 """Rows of the tape whose gradients are added to those of the weights at once: so few that the cache holds them."""
@@ -44,7 +44,7 @@ def descend(moments: Moments, plan: Plan, drives: Drives, truth: Floats, outcome
     """
     theta, (steps, _, lanes, _) = moments.theta, drives.gnss.shape
     net, total, one = new_net(plan, theta), new_net(plan, theta), np.ones(1, theta.dtype)
-    most = min(TRAINED, lanes)
+    most = min(DRIVES_AT_ONCE, lanes)
     together = min(steps, max(1, PRODUCT // most))
     tape = aligned(steps * most, plan.width, theta)
     gradient = aligned(together * most, plan.width, theta)

@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import part
 
-BYTES = 64 if binding.get_host_cpu_features().get("avx512f") else 32
+REGISTER_BYTES = 64 if binding.get_host_cpu_features().get("avx512f") else 32
 """Of a vector register."""
 SHAPES = [(rows, vectors) for rows in (1, 2, 3, 4) for vectors in (1, 2)]
 """Rows and vectors of a tile: eight sums at most, beside which the 16 registers of AVX2 hold what they are made of."""
@@ -33,7 +33,7 @@ def product(
     The entries of a row of a (m, k) are `across` apart, those of the others 1.
     """
     rows, columns, depth = size
-    wide = BYTES // 4 if out[0].itemsize == 4 else BYTES // 8
+    wide = REGISTER_BYTES // 4 if out[0].itemsize == 4 else REGISTER_BYTES // 8
     for j in range(0, columns, 2 * wide):
         vectors = 2 if columns - j > wide else 1
         for i in range(0, rows, 4):
@@ -67,7 +67,7 @@ tile: Any = intrinsic(_tile)
 def _emit(build: Any, shape: tuple[int, int], blocks: Any, across: Any, depth: Any, floor: Any) -> None:
     """One tile; with few sums, several terms of each are added at once, because a sum waits for its last term."""
     cells, terms = [(r, v) for r in range(shape[0]) for v in range(shape[1])], max(1, 8 // (shape[0] * shape[1]))
-    count, word = BYTES // (4 if isinstance(floor.type, ir.FloatType) else 8), depth.type
+    count, word = REGISTER_BYTES // (4 if isinstance(floor.type, ir.FloatType) else 8), depth.type
     vector, lane = ir.VectorType(floor.type, count), ir.IntType(32)
     out, a, b, start = blocks
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from coopoc import InputError, arrays
 from coopoc.arrays import one_of
-from coopoc.text import given_path, visible
+from coopoc.paths import given_path
+from coopoc.text import visible
 
 from ..checkpoint import Checkpoint, read_card, save
 from ..federation.combine import SERVER, screen, too_few

@@ -26,7 +26,6 @@ JOINT, NAIVE, INTERSECTION = range(3)
 """How estimates are fused: in one state, as if their errors were independent, by covariance intersection."""
 WEIGHTS_TRIED = 10
 """Weights that covariance intersection tries."""
-MIN_WEIGHT = 1e-9
 
 
 class PoseMeasurements(NamedTuple):
@@ -215,7 +214,7 @@ def fuse_pair(
         pair.cov[:], pair.hits[:] = 0.0, 0.0
         set_member(pair, 0, poses, observer, d, weight)
         if other >= 0:
-            set_member(pair, d, poses, other, d, max(1.0 - weight, MIN_WEIGHT) if tries > 0 else 1.0)
+            set_member(pair, d, poses, other, d, max(1.0 - weight, 1e-9) if tries > 0 else 1.0)
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
         add_relative(measured, noise, pair, ends, run, k, ZERO)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 PASSES = 3
 """Of the iterated filter: from one more on nothing moves by a hundredth of its standard deviation."""
-START, START_GATE = 30.0, 5.0
+START_SECONDS, START_GATE = 30.0, 5.0
 """s of a drive that show a first pose, and standard deviations of an innovation there."""
 Unit = Literal["solo", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
@@ -188,7 +188,7 @@ class PoseFilter:
             for again, start in enumerate(starts.tolist(), 1):
                 if again == len(every):
                     every.append(np.full_like(every[0], np.nan))
-                part = recording.between(start, min(start + int(START / recording.dt) + 2, len(there)))
+                part = recording.between(start, min(start + int(START_SECONDS / recording.dt) + 2, len(there)))
                 with suppress(*[InputError] * (self.unit == "fleet")):
                     if not known[start, column] and len(part.t) > 1:
                         one = PoseFilter("solo", gate=START_GATE)
@@ -257,7 +257,7 @@ class PoseFilter:
         return noise, PoseOptions(numbers, PASSES if self.exact else 1, get_args(Fusion).index(self.fusion))
 
 
-def pose_start(recording: Recording, *, seconds: float = START, gate: float = START_GATE) -> Floats:
+def pose_start(recording: Recording, *, seconds: float = START_SECONDS, gate: float = START_GATE) -> Floats:
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN of landmarks and who is absent.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the

@@ -14,10 +14,9 @@ from ...world.recording import Recording
 from ...world.sensors import Sensors
 from .pose_inputs import body_of, to_landmarks
 
-HEADINGS, SEEN = 24, 3
-"""That are tried, around the circle and then around the best of them; and from how many places at most."""
-STEP = 2 * np.pi / HEADINGS
-"""rad."""
+HEADINGS, SEEN_PLACES = 24, 3
+"""Headings that are tried, around the circle and then around the best of them; most places that each is tried with."""
+HEADING_STEP = 2 * np.pi / HEADINGS  # rad
 
 
 def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> Floats:
@@ -55,7 +54,7 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
     """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood: of
     headings around the circle, then around the best of them."""
     landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
-    noise, angles = recording.sensors, STEP * np.arange(HEADINGS)
+    noise, angles = recording.sensors, HEADING_STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
         apart, ranges = np.linalg.norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[0, links, 0]
         filter_ = replace(filter_, assumed=_of_vehicles(noise, np.where(np.isnan(ranges), apart, ranges)))
@@ -70,11 +69,11 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
         x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
         return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, column, poses[:, 3], noise)
 
-    for turn in (STEP / 2, 2 * STEP / HEADINGS):
+    for turn in (HEADING_STEP / 2, 2 * HEADING_STEP / HEADINGS):
         poses = _hypotheses(recording, column, links, landmarks, angles)
         best = poses[[np.argmin(filtered(poses, turn)[2])]]
-        angles = best[0, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
-    (x,), (cov,), _ = filtered(best, STEP / 2)
+        angles = best[0, 3] + HEADING_STEP * np.linspace(-1.0, 1.0, HEADINGS)
+    (x,), (cov,), _ = filtered(best, HEADING_STEP / 2)
     return _back(recording, column, x, cov), x[:, :3]
 
 
@@ -132,14 +131,14 @@ def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: 
     return cost
 
 
-SHARP, WINDOW = 0.1, 5.0
-"""m, of places beside a line, below which ranges leave the side open; and s for which measurements count once all were
-seen."""
+LINE_WIDTH, RANGE_SECONDS = 0.1, 5.0
+"""m: ranges to places this near to one line do not tell on which side of it the vehicle is; s for which ranges count
+after the first one to the last place."""
 
 
 def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
-    """(hypotheses, 4) poses at the first step that the first fix, or what is seen first in SEEN places, leaves for each
-    heading, with `places` (L, 3) m of what the links measure."""
+    """(hypotheses, 4) poses at the first step that agree with the first fix, or else with the first measurements of
+    SEEN_PLACES places, one for each heading, with `places` (L, 3) m of what the links measure."""
     body, relative = body_of(recording), recording.relative[0, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[0, :, column, 0]))
     complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
@@ -159,7 +158,7 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
         step = fixes[:1]
         at, offset = recording.gnss[0, step, column], way[step]
     else:
-        first = complete[np.sort(np.unique(places[complete], axis=0, return_index=True)[1])[:SEEN]]
+        first = complete[np.sort(np.unique(places[complete], axis=0, return_index=True)[1])[:SEEN_PLACES]]
         step, at = recording.links.step[links[first]], places[first]
         seen = np.where(np.isfinite(relative[first]), relative[first], np.pi / 2)
         offset = way[step] + turned(to_vector(seen), turns[step])
@@ -172,10 +171,10 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     `way` (T, 3) m."""
     rows = np.flatnonzero(np.isfinite(recording.relative[0, links, 0]))
     at, first = np.unique(places[rows], axis=0, return_index=True)
-    if not len(at) or np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) < 2:
+    if not len(at) or np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), LINE_WIDTH) < 2:
         raise _too_little(recording, column)
     steps = recording.links.step[links[rows]]
-    early = steps <= steps[first.max()] + WINDOW / recording.dt
+    early = steps <= steps[first.max()] + RANGE_SECONDS / recording.dt
     rows, steps = rows[early], steps[early]
     centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
     right = np.square(centres[..., :2]).sum(axis=-1) - recording.relative[0, links[rows], 0] ** 2

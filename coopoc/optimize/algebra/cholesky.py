@@ -8,12 +8,12 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ...workers import one_thread
 
-ALONE = 64
+THREADED_UNKNOWNS = 64
 """Unknowns from which BLAS shares matrices among threads."""
 
 
 def _unshared(size: int) -> Any:
-    return one_thread() if size > ALONE else nullcontext()
+    return one_thread() if size > THREADED_UNKNOWNS else nullcontext()
 
 
 class Cholesky:

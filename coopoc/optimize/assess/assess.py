@@ -30,7 +30,7 @@ DENSE_COLUMNS = 200
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
 rounding."""
-FLAT = 1e-9
+FLAT_CURVATURE = 1e-9
 """Curvature, as a share of the diagonal of J^T J, that is rounding."""
 LEVER = 0.1
 """m or rad, least radius of a way along which no measurement changes."""
@@ -130,7 +130,7 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
         scale, slope = own + (own == 0), _largest(problem, entries, np.abs(gradient))
-        flat = FLAT + (slope / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
+        flat = FLAT_CURVATURE + (slope / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return replace(unknown, unobservable=nodes)

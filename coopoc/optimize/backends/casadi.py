@@ -16,15 +16,13 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, SolverResult
+from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, Capabilities, SolverResult
 from ..model.derivatives import Structure, expressions
 from ..model.factor import stacked, steerable
 from ..model.problem import Problem
 
 FATROP_NUMBERS = 200
 """Numbers that can move up to which FATROP is faster than IPOPT."""
-CHART_MOVES = 10
-"""Moves of the chart of the poses, at most."""
 SUCCESS = "Solve_Succeeded"
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
@@ -47,7 +45,7 @@ FATROP: dict[str, Any] = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable"
 
 
 def solver(
-    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = SOLVER_STEP_TOLERANCE
 ) -> SolverResult:
     """Solve a problem from x (n, ambient).
 
@@ -93,7 +91,7 @@ def _run(
     """Solve around x (n, ambient), and for poses again around the answer until it stays."""
     space, free, count, rounds = form.space, form.movable, 0, 0
     multipliers: Any = 0.0
-    while rounds < CHART_MOVES:
+    while rounds < 10:
         end = nlp(p=_numbers(problem, x), lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
         status = stats["return_status"]

@@ -4,13 +4,13 @@ import numpy as np
 
 from ...arrays import Floats
 from ..algebra.sparse import sparse
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, SolverResult
+from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
 
 def solver(
-    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = SOLVER_STEP_TOLERANCE
 ) -> SolverResult:
     """Solve a problem from x (n, ambient).
 

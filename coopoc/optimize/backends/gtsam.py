@@ -14,13 +14,13 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, SolverResult
+from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, SolverResult
 from ..model.derivatives import linearise
 from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
 from ..model.space import Space, exp
 
-STARTS = 3
+MAX_RESTARTS = 3
 """Times that the optimiser begins where it ended, damped as at first, while it ended damped more; once if linear."""
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
@@ -39,7 +39,7 @@ ESTIMATORS = {
 
 
 def solver(
-    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = SOLVER_STEP_TOLERANCE
 ) -> SolverResult:
     """Solve a problem from x (n, ambient).
 
@@ -53,7 +53,7 @@ def solver(
 
     posed, parts = which_turn(problem), forms(problem)
     graph, used, custom = graph_of(problem, parts), 0, parts.count(None)
-    for _ in range(1 if problem.linear else STARTS):
+    for _ in range(1 if problem.linear else MAX_RESTARTS):
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(max_iterations - used)
         params.setRelativeErrorTol(PRECISE)

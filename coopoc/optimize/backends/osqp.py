@@ -17,7 +17,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend, Capabilities, SolverResult
+from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, Capabilities, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
@@ -49,7 +49,7 @@ STEP_WEIGHT = 1e-6
 
 
 def solver(
-    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = STEP_TOLERANCE
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = SOLVER_STEP_TOLERANCE
 ) -> SolverResult:
     """Solve a problem from x (n, ambient). A linear problem is a single quadratic programme.
 

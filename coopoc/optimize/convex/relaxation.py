@@ -31,7 +31,7 @@ SOLVER = {**dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-9), "ma
 """Settings of Clarabel."""
 SAME_POINT = 1e-2
 """Sum of squares below which two points are one: what is this near, the curvature at a minimum decides."""
-GAP = 1e-6
+CERTIFIED_GAP = 1e-6
 """Largest gap of a certified solution, as a share of its cost (at least of 1, the cost of two residuals of one std)."""
 
 
@@ -147,7 +147,7 @@ class Certificate:
     """Bounds of a solution's cost against the smallest cost of any point.
 
     Args:
-        certified: no point has a cost smaller by more than a share GAP of max(cost, 1).
+        certified: no point has a cost smaller by more than a share CERTIFIED_GAP of max(cost, 1).
         sentence: the verdict in words.
         cost: of the solution.
         lower_bound: no point has a smaller cost.
@@ -202,7 +202,7 @@ def certify(problem: Problem, solution: Solution) -> Certificate:
     reduced = Reduced(form)
     bound, values = reduced.lower_bound(multipliers(form, X, reduced.times(X)), form.columns + 1)
     gap, smallest = solution.cost - bound, float(values[0])
-    certified = gap <= GAP * max(solution.cost, 1.0)
+    certified = gap <= CERTIFIED_GAP * max(solution.cost, 1.0)
     framed = form.stiefel.size and len(values) > form.columns
     alone = certified and bool(framed and 2.0 * max(gap, 0.0) < SAME_POINT * values[-1])
     unique = alone and not solution.unobservable

@@ -17,8 +17,6 @@ Step = Callable[[Floats, Floats, Floats], tuple[Floats, float] | None]
 """(x (n, ambient), the Hessian's values, gradient (m,)) -> dx (m,) and what bounds push along it, y . C dx; None where
 the Hessian is not positive definite."""
 
-GIVE_UP = 1e12
-"""Damping beyond which no step can help."""
 LEAST_DAMPING = 1e-9
 """Damping below which none is left: far below any diagonal it changes no digit of a step."""
 HIDDEN = 1e-9
@@ -27,7 +25,7 @@ MISMATCH = 0.2
 """Distance of the gain ratio, actual over predicted decrease, from 1 that is evidence against J^T J."""
 NONQUADRATIC = 0.5
 """Distance of the gain ratio from 1 at which a step has left the region where the quadratic model holds."""
-AGAINST = 2
+HESSIAN_AFTER_STEPS = 2
 """Steps of evidence against J^T J after which the exact Hessian takes over."""
 GROWTH, DECAY = 10.0, 5.0
 """Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
@@ -99,7 +97,7 @@ def arrive(
     converged, still = False, 0
     cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
-        while len(record) < max_iterations and not converged and mu < GIVE_UP:
+        while len(record) < max_iterations and not converged and mu < 1e12:  # no step can help
             counted(cost)
             damping = _marquardt(system, undamped[2], mu, LEAST_INFORMATION if bounded else 1.0)
             whole = values
@@ -110,7 +108,7 @@ def arrive(
             if taken is None:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
-                    against, model = -AGAINST, "gauss-newton"
+                    against, model = -HESSIAN_AFTER_STEPS, "gauss-newton"
                     cost, gradient, values = undamped = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
@@ -151,8 +149,8 @@ def arrive(
             if model == "gauss-newton":
                 off = abs(gain - 1.0) > MISMATCH
                 against = against + 1 if against < 0 or off else max(against - 1, 0)
-                against = AGAINST if near else against
-                model = "newton" if against >= AGAINST else model
+                against = HESSIAN_AFTER_STEPS if near else against
+                model = "newton" if against >= HESSIAN_AFTER_STEPS else model
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
                 undamped = (cost, gradient, values) if model == "gauss-newton" else undamped

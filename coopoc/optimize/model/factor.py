@@ -36,7 +36,7 @@ LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, floa
 }
 """rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
 
-FLAT = 1e-12
+DEPENDENT_VOLUME = 1e-12
 """Volume of the rows of W, as a share of that of rows at right angles, up to which some may be of no rank."""
 
 
@@ -158,7 +158,7 @@ class Factor:
         if self.std is not None:
             return np.broadcast_to(np.isfinite(self.std).sum(axis=1), len(self.nodes))
         root, rank = self.root, np.full(len(self.nodes), self.size)
-        flat = ~(np.abs(np.linalg.det(root)) > FLAT * np.linalg.norm(root, axis=2).prod(axis=1))
+        flat = ~(np.abs(np.linalg.det(root)) > DEPENDENT_VOLUME * np.linalg.norm(root, axis=2).prod(axis=1))
         rank[flat] = np.linalg.matrix_rank(root[flat])  # which takes as long as many steps of a solve
         return rank
 

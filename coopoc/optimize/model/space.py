@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import TWO_TURNS, Floats, checked, number, refuse
+from ...arrays import Floats, check_turns, checked, number, refuse
 from ...errors import InputError
 from ...formats.values import to_orientation
 
@@ -136,9 +136,7 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     """
     at, w = checked("position", position), checked("turn", turn)
     refuse("turn", w, ~(np.abs(w) <= MAX_ANGLE), "must be finite, at most 10^6 rad", "Give rad.")
-    jump = np.abs(np.diff(w, axis=0, prepend=0.0) if w.ndim else w) > TWO_TURNS  # a drive's may be unwrapped
-    hint = "Convert degrees by np.deg2rad, and wrap what is unwrapped."
-    refuse("turn", w, jump, "must be in rad, and jump by less than two turns", hint)
+    check_turns("turn", w)
     if not at.ndim or at.shape[-1] not in (2, 3):
         allowed = "must have shape (..., 2) or (..., 3)"
         raise InputError("position", f"shape {at.shape}", allowed, "Give x, y or x, y, z of each.")

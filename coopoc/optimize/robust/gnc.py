@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import INLIER_WEIGHT, expected, implausible, rejection
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE, Backend
+from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend
 from ..descent.levenberg_marquardt import Arrival, arrive
 from ..graph_problems import started
 from ..model.factor import Loss
@@ -100,7 +100,7 @@ def solve_gnc(
         if problem.constraints:
             end = solve(part, backend, throw=False, covariance=False, **options)
         else:
-            end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, STEP_TOLERANCE)
+            end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, SOLVER_STEP_TOLERANCE)
         each.append(end.iterations)
         return end.x
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Floats, Ints, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
-from ..backend import MAX_ITERATIONS, STEP_TOLERANCE
+from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
@@ -22,7 +22,7 @@ MAX_ROUNDS = 300
 """About 20 are needed."""
 MU_RATE = 1.4
 """By which mu changes from round to round."""
-SETTLED = 1e-6
+SETTLED_CHANGE = 1e-6
 """Largest change of a weight that is none."""
 EASY = 1e-6
 """Below this mu is not inverted: all candidates are far within their thresholds."""
@@ -67,7 +67,7 @@ SURROGATES = {
         lambda worst: max(2.0 * worst, 1.0),
         lambda s, mu: np.square(mu / (s + mu)),
         lambda mu: max(mu / MU_RATE, 1.0),
-        lambda new, old, mu: mu == 1.0 and bool((np.abs(new - old) <= SETTLED).all()),
+        lambda new, old, mu: mu == 1.0 and bool((np.abs(new - old) <= SETTLED_CHANGE).all()),
         1.0,
     ),
 }
@@ -227,7 +227,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
 
     def inner(part: Problem) -> Floats:
         nonlocal steps
-        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, STEP_TOLERANCE)
+        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, SOLVER_STEP_TOLERANCE)
         steps += end.iterations
         return end.x
 

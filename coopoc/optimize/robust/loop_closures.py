@@ -18,22 +18,16 @@ from ..starts.initial import initial_guess
 from ..starts.pose_starts import along_poses
 from .candidates import Inner, Marked
 
-JOIN_ROUNDS = 100
-"""About 15 are needed: half of those that fit join in each."""
 MAX_JOINS = 2
 """Times that a candidate may join: one that a wrong neighbour has displaced returns once that is gone."""
 NONLINEAR_FACTOR = 10.0
 """Times its bound up to which a d^2 is checked by a solve: predictions along a drive are linear, its arc is not."""
 MAX_RESOLVES = 10
 """Solves of these at most, the least certain predictions first."""
-RESOLVE_STEPS = 20
-"""Of such a solve; a loop that fits needs fewer."""
-RESOLVE_TOLERANCE = 1e-3
-"""m or rad, a step that ends it."""
 HYPOTHESES = 20
 """Placements of a pair of bodies, spread over its candidates, and as many of those that contradict the best: where
 60 % of the candidates are wrong, 20 of them hold no right one in 4 of 100,000 cases."""
-AGREEING = 2
+MIN_AGREEING = 2
 """Candidates that must agree, the placement's own included: one alone proves nothing."""
 WORLD_BODY = -1
 """The body that known inliers join to the world: to fixed nodes, or to nodes with measurements of their own."""
@@ -143,7 +137,7 @@ class Decided:
         judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
         sparse(marked.problem)  # is kept as long as the problem is, so that all rounds share its analysis
         most_joins, rounds = 1, 0
-        while rounds < JOIN_ROUNDS:
+        while rounds < 100:  # about 15 are needed: half of those that fit join in each
             self.x, rounds = inner(marked.reweigh(weight, self.x)), rounds + 1
             leaving = judged & (weight > 0) & (marked.squares(self.x) > bound)
             left[leaving], weight[leaving] = left[leaving] + 1, 0.0
@@ -170,7 +164,7 @@ class Decided:
         for joins in (0.0, 1.0):
             self.weight[group] = joins
             system = sparse(marked.reweigh(self.weight, self.x))
-            costs.append(system.cost(arrive(system, self.x, RESOLVE_STEPS, RESOLVE_TOLERANCE).x if joins else self.x))
+            costs.append(system.cost(arrive(system, self.x, 20, 1e-3).x if joins else self.x))
         good = 2.0 * (costs[1] - costs[0]) <= self.bound[group]
         self.weight[group] = float(good)
         return bool(good)
@@ -193,7 +187,7 @@ class Decided:
             leader, rival = self._vote(body, (int(pairs[p, 0]), int(pairs[p, 1])), groups[which.ravel() == p])
             to, of = ("world" if k == WORLD_BODY else problem.names[k] for k in leader.bodies)
             row = {"body": of, "to": to, "agree": leader.rank[0], "rival": rival, "candidates": int(count[p])}
-            if leader.rank[0] < AGREEING or leader.rank[0] <= rival:
+            if leader.rank[0] < MIN_AGREEING or leader.rank[0] <= rival:
                 sentence = "of {candidates} between {body} and {to} {agree} agree, {rival} otherwise"
                 undecided.append(sentence.format(**row))
             elif best is None or leader.rank > best.rank:

@@ -21,8 +21,6 @@ STAGE = 25
 """Poses of the longest robot that the growing start adds at a time, at least."""
 STAGES = 60
 """At most, unless odometry turns by more than DRIFT in one."""
-MOST_STAGES = 200
-"""Whatever the odometry."""
 DRIFT = 0.5
 """rad, standard deviation by which odometry may turn in a stage: beyond it a stage begins in no basin."""
 SWEEPS = 10
@@ -31,10 +29,6 @@ PROXIMAL = 1e-4
 """Weight of the last rotations beside that of a median relative rotation: it acts over a hundred poses of a chain."""
 WHOLE_GROWTH = 1.5
 """Growth after which a stage moves all nodes; the others move what is new and was so one stage before, and points."""
-STAGE_STEPS = 5
-"""Of each stage."""
-STAGE_TOLERANCE = 1e-2
-"""m or rad, a step at which a stage has arrived for the purpose."""
 CUT_SPHERES = 12
 """Of the ranges of a point, whose spheres are cut."""
 HOLDING = 2
@@ -343,7 +337,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
         if stage == count - 1 or solved.sum() >= WHOLE_GROWTH * whole:
             free, whole = solved, int(solved.sum())
         part, kept = _among(problem, solved, free, x)
-        end = arrive(sparse(part), np.array(part.x0), STAGE_STEPS, STAGE_TOLERANCE)
+        end = arrive(sparse(part), np.array(part.x0), 5, 1e-2)
         x[kept], iterations = end.x, iterations + end.iterations
     return x, iterations
 
@@ -365,7 +359,7 @@ def _stages(graph: Graph) -> int:
     longest = max(len(places) for places in graph.robots.values())
     turns = graph.relative_pose.covariance[:, graph.dimension :, graph.dimension :]
     variance = np.median(np.einsum("mii->m", turns) / turns.shape[-1]) if len(turns) else 0.0
-    drifting = min(longest * variance / DRIFT**2, MOST_STAGES)
+    drifting = min(longest * variance / DRIFT**2, 200)
     return max(min(longest // STAGE, max(STAGES, int(drifting))), 1)
 
 

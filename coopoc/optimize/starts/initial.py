@@ -10,9 +10,7 @@ from ..model.factor import Factor, as_factor, bounded, unchecked
 from ..model.measurements import converted_rows
 from ..model.problem import Problem
 
-TRIES = 5
-"""Of random moves."""
-NUDGE = 0.1
+NUDGE_STD = 0.1
 """m or rad, standard deviation of such a move."""
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
@@ -49,13 +47,13 @@ def _converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
 def directed(problem: Problem, x: Floats) -> Floats:
     """Nodes x (n, ambient) with those moved at random at which a measurement has no derivative."""
     rng, movable = np.random.default_rng(0), problem.movable
-    for _ in range(TRIES):
+    for _ in range(5):
         lost = [nodes for _, nodes in undirected(problem, x)]
         if not lost:
             break
         step = np.zeros(movable.shape)
         nodes = np.unique(np.concatenate(lost))
-        step[nodes] = NUDGE * rng.normal(size=(len(nodes), movable.shape[1]))
+        step[nodes] = NUDGE_STD * rng.normal(size=(len(nodes), movable.shape[1]))
         x = problem.space.retract(x, step * movable)
     return x
 

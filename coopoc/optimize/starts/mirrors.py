@@ -29,10 +29,6 @@ ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
 MOVED_NODES = 1800
 """Of the cycles together that are wound the other way round."""
-LEVEL_TIE = 1e-9
-"""m^2, by which a level plane wins."""
-MOVE_ROUNDS = 15
-"""Of moves, of which three are usual."""
 MIN_SAVING = 1e-6
 """Share of the cost that a move must save."""
 
@@ -145,7 +141,7 @@ def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
     (K, d), a level one where several fit, keeping their handedness."""
     space, middle = problem.space, places.mean(axis=0)
     gaps, at = places - middle, space.position(nodes)
-    normal = np.linalg.eigh(gaps.T @ gaps + LEVEL_TIE * np.diag(np.arange(space.dimension) < 2))[1][:, 0]
+    normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, 0]
     image = at - 2.0 * np.outer((at - middle) @ normal, normal)
     turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
     moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
@@ -214,7 +210,7 @@ def across(
     loose, least, count, ends = bodies(problem, x), cost(x), 0, list[tuple[float, Floats]]()
     if len(loose) == len(problem.names) or not any(f.kind in RANGES for f in problem.factors):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
-    while count < MOVE_ROUNDS:
+    while count < 15:  # three are usual
         ranges, ends = ranges_of(problem, x), []
         single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
         turns = islice(rewound(problem, x, DOUBTED_COST), min(MAX_DESCENTS, MOVED_NODES // len(x)))

@@ -22,7 +22,7 @@ FIELDS = {
     "range": "ranges",
 }
 """Kinds of a graph's edges, by the kind of a factor without what follows its name."""
-UNKNOWN = 1e-9
+UNMEASURED_WEIGHT = 1e-9
 """1/m^2 or 1/rad^2, of a component that is not measured."""
 
 
@@ -80,7 +80,7 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
     """Values and covariances of a factor as a graph's edges have them, the same along all axes and about them."""
     d, space = problem.dimension, problem.space
     factor = as_vectors(factor) if factor.kind == "body_spherical" else factor
-    information, z = np.square(factor.root).sum(axis=1) + UNKNOWN, factor.z
+    information, z = np.square(factor.root).sum(axis=1) + UNMEASURED_WEIGHT, factor.z
     variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
     if factor.measurement.compares_poses:
         z = np.concatenate([space.position(z), to_orientation(space.rotation(z))], axis=1)

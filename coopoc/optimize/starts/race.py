@@ -27,8 +27,6 @@ RACE_TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
 EXCESS_STDS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
-JUDGED_STEPS = 50
-"""Steps before it is judged."""
 RIVAL_COST = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
 DRAWS, QUIET_DRAWS, DRAWN_POINTS, HIGH_STDS = 90, 30, 1800, 2.0
@@ -73,7 +71,7 @@ def race(
     usual = EXCESS_STDS * np.sqrt(variance)
     limit = mean + usual
 
-    def descend(x: Floats, steps: int = JUDGED_STEPS) -> Floats:
+    def descend(x: Floats, steps: int = 50) -> Floats:
         nonlocal taken, arrived
         end = arrive(system, x, steps, RACE_TOLERANCE)
         taken, arrived = taken + end.iterations, end.converged
