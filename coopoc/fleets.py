@@ -40,13 +40,11 @@ def read_log(path: str | Path, **options: Any) -> Any:
     return find("coopoc.readers", "log")(path, **options)
 
 
-def fetch(name: str, *, offline: bool = False, timeout: float = 20.0) -> Path:
+def fetch(name: str) -> Path:
     """Local path of a public data set, downloaded once and verified by SHA-256; see `coopoc.data.fetch.fetch`.
 
     Args:
         name: a name that `coopoc data list` shows, such as "plaza1".
-        offline: True asks no server, and verifies what is there.
-        timeout: s without a byte, after which a server is given up.
 
     Returns:
         The file or folder that `load_fleet`, `read_log` and `read_graph` take.
@@ -54,5 +52,5 @@ def fetch(name: str, *, offline: bool = False, timeout: float = 20.0) -> Path:
     Raises:
         InputError: an unknown name, no network, other bytes: with the address and where to put the file by hand.
     """
-    path: Path = find("coopoc.readers", "fetch")(name, offline=offline, timeout=timeout)
+    path: Path = find("coopoc.readers", "fetch")(name)
     return path

@@ -11,7 +11,7 @@ from coopoc import InputError, plot_recording, plot_track
 from coopoc.arrays import one_of
 from coopoc.paths import replaceable, write
 
-from .fetch import TIMEOUT, Entry, fetch, public
+from .fetch import Entry, fetch, public
 from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
@@ -37,20 +37,18 @@ def list_() -> None:
     print(tabulate(rows, headers="keys", tablefmt="github"))
 
 
-def get(names: tyro.conf.Positional[tuple[str, ...]], /, *, offline: bool = False, timeout: float = TIMEOUT) -> None:
+def get(names: tyro.conf.Positional[tuple[str, ...]], /) -> None:
     """Fetch public measurements by name, verify them by SHA-256, and print the paths that --data takes.
 
     Example: coopoc data get f9k plaza1
 
     Args:
         names: as coopoc data list shows them.
-        offline: ask no server; verify what is there.
-        timeout: s without a byte, after which a server is given up.
     """
     if not names:
         raise InputError("names", "()", "must name a data set", "coopoc data list shows them.")
     for name in names:
-        print(fetch(name, offline=offline, timeout=timeout))
+        print(fetch(name))
 
 
 def show(name: tyro.conf.Positional[str]) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urljoin
 
-from coopoc.arrays import number
 from coopoc.errors import InputError, said, suggestion, unknown
 from coopoc.workers import progress_bar
 
@@ -146,7 +145,7 @@ def local(name: str) -> Path | None:
     return entry.path
 
 
-def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path:
+def fetch(name: str) -> Path:
     """Local path of a public data set, downloaded once and verified by SHA-256.
 
     COOPOC_DATA names the folder of all data, else it is the user's cache. COOPOC_MIRROR is a base address at which a
@@ -154,8 +153,6 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
 
     Args:
         name: a name that `coopoc data list` shows.
-        offline: True asks no server, and verifies what is there.
-        timeout: s without a byte, after which a server is given up.
 
     Returns:
         The file or folder that `load_fleet`, `read_log` and `read_graph` take.
@@ -169,20 +166,13 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
         raise unknown("data", name, public())
     if entry.by_hand:
         raise InputError("data", repr(name), f"is served by {entry.page} alone, to its users", entry.by_hand)
-    number("timeout", timeout, 1e-3, allowed="s, above 0", hint="Give seconds.")
     from filelock import FileLock
 
-    absent = entry.absent()
-    if absent and offline:
-        file = entry.folder / absent[0]
-        state = f"SHA-256 {_digest(file)} must have SHA-256 {entry.files[absent[0]][2]}" if file.exists() else "missing"
-        reason = f"offline, and {len(absent)} of {len(entry.files)} files are not there, first {file.name}: {state}"
-        raise _by_hand(entry, entry.address(absent[0]), file, reason)
-    if absent:
+    if not entry.fetched:
         try:
             entry.folder.mkdir(parents=True, exist_ok=True)
             with FileLock(entry.folder / ".lock"):
-                _bring(entry, timeout)
+                _bring(entry)
         except OSError as error:
             raise InputError(
                 "COOPOC_DATA",
@@ -193,23 +183,23 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
     return entry.path
 
 
-def _bring(entry: Entry, timeout: float) -> None:
+def _bring(entry: Entry) -> None:
     """Download what is absent: each file from its address or the mirror's, else the archive of all; and keep what has
     the right bytes."""
     absent, unpacked = entry.absent(), dict[str, bytes]()  # another process may have brought it meanwhile
     if absent and entry.address(absent[0]) == entry.archive:
-        data = _downloaded(entry, entry.archive, entry.folder / ARCHIVE, entry.bytes, timeout)
+        data = _downloaded(entry, entry.archive, entry.folder / ARCHIVE, entry.bytes)
         unpacked = _unpacked(entry, absent, data)
     for file in absent:
         address, (_, size, digest), path = entry.address(file), entry.files[file], entry.folder / file
-        data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
+        data = unpacked[file] if unpacked else _downloaded(entry, address, path, size)
         if (actual := hashlib.sha256(data).hexdigest()) != digest:
             raise _by_hand(entry, address, path, f"SHA-256 {actual} must have SHA-256 {digest}; it was removed")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
 
 
-def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float) -> bytes:
+def _downloaded(entry: Entry, address: str, to: Path, size: int) -> bytes:
     """What an address serves, in memory: the largest data set has tens of megabytes.
 
     Args:
@@ -217,7 +207,6 @@ def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float)
         address: asked for.
         to: its place, for the progress bar and for whom has to fetch it by hand.
         size: bytes of the file; of an archive the most that it may have. One byte more shows another file.
-        timeout: s without a byte.
 
     Raises:
         InputError: what went wrong, and how to fetch it by hand.
@@ -225,7 +214,7 @@ def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float)
     data = bytearray()
     try:
         bar = progress_bar(desc=to.name, total=size, unit="B", unit_scale=True, delay=2.0)
-        with urllib.request.urlopen(address, timeout=timeout) as answer, bar:
+        with urllib.request.urlopen(address, timeout=TIMEOUT) as answer, bar:
             while len(data) <= size and (chunk := answer.read(65536)):
                 data += chunk
                 bar.update(len(chunk))
@@ -234,7 +223,7 @@ def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float)
             raise ConnectionError(f"closed the connection after {len(data)} of {len(data) + rest} bytes")
     except (OSError, HTTPException, ValueError) as error:
         late = isinstance(getattr(error, "reason", error), TimeoutError)
-        raise _by_hand(entry, address, to, f"sent nothing for {timeout:g} s" if late else said(error)) from None
+        raise _by_hand(entry, address, to, f"sent nothing for {TIMEOUT:g} s" if late else said(error)) from None
     return bytes(data)
 
 
@@ -254,6 +243,8 @@ def _unpacked(entry: Entry, files: list[str], data: bytes) -> dict[str, bytes]:
 
 def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
     """The error of a download, with the address and the place of the file."""
+    if there := _digest(to):
+        reason += f"; what is there has SHA-256 {there}"
     if address == entry.archive:
         advice = f"unpack it in {entry.folder}, so that {next(iter(entry.files))} is below"
     else:
