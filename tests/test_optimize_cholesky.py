@@ -5,8 +5,9 @@ import pytest
 from scipy.sparse import csc_matrix, triu
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from coopoc.kernels.graphs import multifrontal
 from coopoc.kernels.graphs.multifrontal import supernodes
-from coopoc.optimize.algebra.cholesky import Cholesky, DenseCholesky
+from coopoc.optimize.algebra.cholesky import Cholesky
 from coopoc.workers import one_thread
 
 
@@ -75,16 +76,15 @@ def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():
     assert found.tolist() == [0, 5, 10, 15, 20]
 
 
-def test_small_matrices_are_factored_by_one_thread():
+def test_small_matrices_are_factored_by_one_thread(monkeypatch):
     """Of two cores that share 150 rows each waits for the other, a hundred times as long as one alone takes."""
-    cholesky, threads = DenseCholesky(np.arange(151), np.arange(150)), set[int]()
-    whole = cholesky._dpotrf
+    cholesky, threads, whole = Cholesky(np.arange(151), np.arange(150)), set[int](), multifrontal.factorise
 
-    def counted(*arguments, **options):
+    def counted(*arguments):
         threads.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
-        return whole(*arguments, **options)
+        return whole(*arguments)
 
-    cholesky._dpotrf = counted
+    monkeypatch.setattr(multifrontal, "factorise", counted)
     with threadpool_limits(2):
         assert cholesky.factor(np.ones(150))
     assert threads == {1}

@@ -73,50 +73,6 @@ class Cholesky:
         return inverse[places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
-class DenseCholesky:
-    """A = U^T U of small matrices, of one row at least, by LAPACK, with the interface of `Cholesky`.
-
-    Args:
-        indptr: (u + 1,) of the upper triangle, CSC.
-        indices: of its rows.
-
-    >>> cholesky = DenseCholesky(np.array([0, 1, 3]), np.array([0, 0, 1]))
-    >>> cholesky.factor(np.array([2.0, 1.0, 2.0])), cholesky.solve(np.array([3.0, 3.0])).round(6)
-    (True, array([1., 1.]))
-    """
-
-    def __init__(self, indptr: Ints, indices: Ints) -> None:
-        from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
-
-        self._dpotrf, self._dpotri, self._dpotrs = dpotrf, dpotri, dpotrs
-        self._size = len(indptr) - 1
-        self._place = np.asarray(indices) + self._size * np.repeat(np.arange(self._size), np.diff(indptr))
-
-    def factor(self, values: Floats) -> bool:
-        """Factor an upper triangle's values; whether it is positive definite."""
-        matrix = np.zeros(self._size**2)
-        matrix[self._place] = values
-        with _unshared(self._size):
-            self._root, info = self._dpotrf(matrix.reshape(self._size, -1).T, clean=0, overwrite_a=1)
-        return bool(info == 0)
-
-    @property
-    def pivots(self) -> Floats:
-        """(u,) squares of U's diagonal."""
-        return np.asarray(np.square(self._root.diagonal()))
-
-    def solve(self, rhs: Floats) -> Floats:
-        """(u,) A^-1 rhs."""
-        with _unshared(self._size):
-            return np.asarray(self._dpotrs(self._root, rhs)[0])
-
-    def inverse(self, rows: Ints, columns: Ints) -> Floats:
-        """A^-1 at pairs of unknowns (K,)."""
-        with _unshared(self._size):
-            whole = self._dpotri(self._root)[0]
-        return np.asarray(whole[np.minimum(rows, columns), np.maximum(rows, columns)])
-
-
 def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
     """Factors of a sparse symmetric matrix (SciPy's, any format), or None: it is not positive definite. The group is
     that of `Cholesky`.
@@ -137,7 +93,7 @@ def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
     return cholesky if cholesky.factor(upper.data) else None
 
 
-def columns_solved(cholesky: Cholesky | DenseCholesky, right: Floats) -> Floats:
+def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
     """(u, K) A^-1 right, column by column."""
     return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 

@@ -15,12 +15,12 @@ from ..model.derivatives import Kind, Model, Structure, Term, numbers_of, write
 from ..model.factor import steerable
 from ..model.problem import Problem
 from ..model.space import Space
-from .cholesky import Cholesky, DenseCholesky
+from .cholesky import Cholesky
 
 LIBRARIES = ("scipy.sparse", "coopoc.kernels.graphs.graph_tape", "coopoc.kernels.graphs.multifrontal")
 """What every solve imports late, so that `import coopoc` stays quick."""
-DENSE_UNKNOWNS, SMALL_UNKNOWNS = 60, 200
-"""Unknowns up to which one dense matrix is as fast, and up to which layouts are kept."""
+SMALL_UNKNOWNS = 200
+"""Unknowns up to which layouts are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +125,11 @@ class Layout:
         self._tapes: dict[Model, list[tuple[Any, Ints, Ints]]] = {}
 
     @property
-    def cholesky(self) -> Cholesky | DenseCholesky:
+    def cholesky(self) -> Cholesky:
         """Factors of its Hessians; each thread has its own."""
         if not hasattr(self._local, "cholesky"):
-            pattern = self.entries.indptr, self.entries.indices
             group = np.nonzero(self.entries.number >= 0)[0]
-            small = 0 < self.entries.size <= DENSE_UNKNOWNS
-            self._local.cholesky = DenseCholesky(*pattern) if small else Cholesky(*pattern, group)
+            self._local.cholesky = Cholesky(self.entries.indptr, self.entries.indices, group)
         return self._local.cholesky  # type: ignore[no-any-return]
 
     def total(self, model: Model, x: Floats, numbers: Sequence[Floats]) -> Floats:
@@ -210,7 +208,7 @@ class Sparse:
         return self.entries.size
 
     @property
-    def cholesky(self) -> Cholesky | DenseCholesky:
+    def cholesky(self) -> Cholesky:
         """Factors of its Hessians, whose ordering is kept; each thread has its own."""
         return self.layout.cholesky
 
