@@ -15,9 +15,9 @@ MIN_TYPICAL_SPEED, MAX_TYPICAL_SPEED = 2e-3, 500.0
 REGION = 2.0
 """Degrees that a fleet spans at most; robots that stand in a room, and tremble in motion capture, are metres apart."""
 MIN_INSTANTS, MAX_INSTANTS_PER_ROW = 500_000, 200
-"""Steps times vehicles that any file may take, and how many more a row of it may."""
+"""Steps times vehicles that a file of any length may fill, and most of them for each row of a longer one."""
 PLANE_STD = 0.01
-"""m and rad: how well z = 0, and with it an inclination of pi/2, is known where heights were not measured."""
+"""m and rad, standard deviations of z = 0 and of an inclination of pi/2 where heights were not measured."""
 
 
 def assemble(
@@ -286,8 +286,8 @@ def planar_recording(
     sensors: Sensors,
     note: str,
 ) -> Recording:
-    """One run, nothing simulated, over an ideal channel; landmarks stand, have their place as a fix at every step, and
-    send nothing. Of several measurements of a pair in a step the one nearest to its instant is kept.
+    """A measured recording of one run, over an ideal channel. Landmarks have their position as a fix at every step and
+    send nothing. Of several measurements of a pair in a step the one nearest to the step's time is kept.
 
     Args:
         ids: of n robots, then of the landmarks.

@@ -9,6 +9,7 @@ import numpy as np
 
 from coopoc import Fleet, InputError
 from coopoc.formats import trajectories as tum
+from coopoc.paths import write
 from coopoc.text import spreadsheet
 
 from .assemble import assemble
@@ -55,10 +56,12 @@ def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
     frame = fleet.to_frame().rename(columns={"vehicle": "id"}).round({"t": 6})[[*NEEDED, *velocity * VELOCITY]]
     frame = frame.sort_values("id", key=lambda ids: ids.map(fleet.ids.index), kind="stable")
     if path.suffix != ".parquet":
-        frame.assign(id=frame["id"].map(spreadsheet)).to_csv(path, index=False, lineterminator="\n")
+        named = frame.assign(id=frame["id"].map(spreadsheet))
+        write(path, named.to_csv(index=False, lineterminator="\n"))
     else:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
-        frame.to_parquet(path, index=False, compression="zstd", use_dictionary=["id", "t"], column_encoding=split)
+        options = {"compression": "zstd", "use_dictionary": ["id", "t"], "column_encoding": split}
+        write(path, lambda file: frame.to_parquet(file, index=False, **options))
 
 
 def tum_files(path: Path) -> list[Path]:

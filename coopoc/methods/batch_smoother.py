@@ -32,10 +32,11 @@ CENTRE = (
 )
 NOT_CAUSAL = "not causal: every estimate depends on the whole drive"
 MIN_ANGLE_STDS = 0.1
-"""Share of a range's standard deviation: angles are no more certain than at this distance, whatever the sensors'
-`min_range`. In one place they would weigh so much that all digits are lost."""
+"""Least distance of an angle's noise, over a range's standard deviation, whatever the sensors' `min_range`: the angles
+between two vehicles in one place would have so large a weight that all digits are lost."""
 STIFF = 1e-5
-"""Least noise of a motion over that of a fix: where vehicles hardly move less would hide all other measurements."""
+"""Least ratio of a motion's noise to a fix's. With less, a vehicle that hardly moves would have motions of so large a
+weight that rounding hides all other measurements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,8 @@ class BatchSmoother(Checked):
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
-        robust: what does not fit weighs less, what is far off nothing (`coopoc.kernels.gate`): fixes at the vehicles'
-            own filters and, as relative measurements, at a solution with Huber's loss.
+        robust: measurements beyond their gate weigh less, far beyond it nothing (`coopoc.kernels.gate`). Fixes are
+            gated by the vehicles' own filters, and with the relative measurements at a solution with Huber's loss.
     """
 
     noise_model: NoiseModel | str = "nominal"

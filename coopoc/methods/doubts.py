@@ -1,4 +1,4 @@
-"""What contradicts the estimates of a track: fixes, the odometer, and what is had of neighbours."""
+"""Notes on what contradicts a track's estimates: fixes, odometry, messages and measurements of neighbours."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from ..world.recording import Recording
 from .noise_model import NoiseModel
 
 JUDGED_SECONDS = 1.0
-"""s between two fixes that are judged together, at least; twice that between two numbers of a neighbour."""
+"""Least s between two fixes that are judged together; between two numbers of a neighbour twice as much."""
 DOUBTS = (
     "fixes, {}: far from its estimates; it is lost, or rejects them",
     "covariances, {}: contradicted by fixes",

@@ -52,7 +52,7 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
 
 
 def follow(method: Method, recording: Recording, egos: Vehicles) -> Track:
-    """The track of any method across gaps, of one that knows nothing of them, too."""
+    """Track of any method across gaps, also of one that does not handle gaps itself."""
     instance("method", method, Method, "Give co.Kalman(), or one as in docs/extend.md.")  # type: ignore[type-abstract]
     return in_stretches(type(method).__call__)(method, recording, egos)
 

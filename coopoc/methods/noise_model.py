@@ -194,17 +194,18 @@ FINEST = 1e-5
 """Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
 beside 1 leaves the fixes six of double precision's sixteen digits."""
 COARSE_DISTANCE = 30.0
-"""m, distance at which an angle is coarse."""
+"""m, distance that turns the noise of an angle into metres."""
 SAMPLED = 2000
-"""Measurements whose median distance counts for a recording's."""
+"""Measurements of which the median distance is taken."""
 UNEVEN = 3e-7
 """Least variance that is assumed of a relative measurement, over the product of the largest std of a fix and of its own
 components: information that is large in one direction and small in another loses the small one's digits, too."""
 
 
 def _held_out(make: type[NoiseModel], recording: Recording, fleet: Fleet) -> tuple[float, float]:
-    """By how many m a Kalman filter fitted to the first two thirds errs more in the plane on the last third than as
-    stated, in the mean over blocks of time, and half its 95 % interval; infinite where nothing shows it."""
+    """How much larger, m, a Kalman filter's error in the plane is on the last third with noise fitted to the first two
+    thirds than with the stated noise: the mean over blocks of time, and half its 95 % interval; infinite where too
+    little was measured."""
     from scipy.stats import t
 
     split, kalman = 2 * len(recording.t) // 3, find("coopoc.methods", "kalman")

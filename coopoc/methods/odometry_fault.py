@@ -14,8 +14,9 @@ from .noise_model import NoiseModel, motion_noise
 def with_odometry(
     recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0
 ) -> tuple[Recording, NoiseModel]:
-    """The recording with velocities that fixes correct, of vehicles whose odometry fails, and the noise of these, with
-    a note; both as they are where none fails, no noise is stated, or velocities are uncertain as those of fixes are.
+    """The recording with corrected velocities of vehicles whose odometry fails, and the noise model with the noise of
+    these and a note. Both are returned unchanged where no odometry fails, no noise is stated, or velocities were
+    derived from fixes.
 
     Args:
         recording: in the world frame.

@@ -58,21 +58,21 @@ MISTAKEN = (
 LEAST_FIXES, FRAME_STDS = 5, 1.5
 """Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
 OFFSET_ERRORS = 6.0
-"""Standard errors of an offset beyond which it is no chance."""
+"""Standard errors of an offset beyond which it is significant."""
 LEAST_ARM, LONGEST_ARM = 0.2, 30.0
 """m, least arm of an antenna that is reported, and longest that is one."""
 CONFIDENT_RATIO = 3.0
-"""Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
+"""Ratio of a filter's errors to their stated standard deviations, in a part of the drive, from which it is reported."""
 UNUSED_SHARE = 0.05
-"""Share of what was logged that may be left out without a word."""
+"""Share of the logged rows that may be left out without a sentence."""
 PERHAPS = 2.0
-"""Standard errors from which an error may be one."""
+"""Standard errors from which an error may be real, and is named as not known."""
 DIVERGED = 0.3
-"""Share of its speeds that no odometry errs by, so that a filter that estimates it has diverged."""
+"""Scale error of odometry beyond which the filter that estimates it has diverged."""
 USED = "fixes", "relative measurements", "edges", "messages"
-"""Words for what is counted where it is used, as odometry and headings are not."""
+"""Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
-"""Beginnings of what is left out as it should be."""
+"""Beginnings of reasons that are no fault of the log."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
     "repeated rows": "Do stamps lack a fraction, as stamp.sec without nanosec, or in 32 bits? Do two share a name?",

@@ -15,27 +15,28 @@ from .motion import MOVING
 from .residuals import Check, filtered, plane, residual_of
 
 SURE_ERRORS = 4.0
-"""Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
+"""Standard errors beyond which an estimate is significant: of the hundreds in a few logs one exceeds three."""
 LEAST_LAG, LEAST_SCALE, LEAST_TURN, LEAST_DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 BESIDE, BEHIND = 0.1, 0.5
-"""m/s, least velocity beside that of the odometry that is reported, and s, least lag of fixes behind it."""
+"""m/s, least velocity across that of the odometry, and s, least lag of fixes behind it, that are reported."""
 UNITS_APART = 0.2
-"""Share by which lengths are off from which their unit is wrong."""
+"""Relative error of lengths from which their unit is wrong."""
 LEAST_COUNT = 20
 """Measurements from which a statistic is reported."""
 MOVED_STDS = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 LEAST_CORRELATION = 0.97
-"""Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
+"""Correlation of the displacements of fixes and odometry that noise alone does not reach."""
 MIN_OWN_SHARE = 0.02
-"""Share of a cause, squared, that no others may make up, so that it can be told from them."""
+"""Least share of a cause's sum of squares that the other causes do not explain, so that it can be told from them."""
 OUTLYING, DRIVE_PARTS = 5.0, 10
-"""Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
+"""Multiples of the median residual beyond which one is left out; parts of a drive, whose estimates give the standard
+error."""
 LONG_LAG = 2.0
-"""s, from which a lag is looked for, not estimated."""
+"""s, from which a lag is searched for: shorter ones are estimated linearly."""
 LONGEST_LAG, LAG_STEP = 60.0, 0.1
-"""s, of lags that are looked for, and from one to the next."""
+"""s, longest lag of the search, and its step."""
 STEADY_SPEED_RATIO, NUDGE_STEP = 0.15, 0.01
 """Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
 are moved to see what a filter makes of an arm."""

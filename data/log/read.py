@@ -48,7 +48,7 @@ Stamps = Literal["header", "received"]
 DAY = 86400.0
 """s."""
 LOST = 0.02
-"""Most of the fixes that may fall on a step that has one."""
+"""Largest share of the fixes that may fall on a step that already has one, and are lost."""
 SHORTEST_STEP, LONGEST_STEP, PAIR = 0.02, 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
 FREQUENT_SHARE = 0.1
@@ -66,10 +66,10 @@ entry."""
 TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 """Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
 SPARSE_SECONDS = 0.5
-"""s between samples of a truth, from which lines between them are no way that was driven, and within which of one the
-curve through them is."""
+"""s between samples of a truth from which straight lines between them are not the path; within so many s of a sample
+the curve through all counts as truth."""
 DRIVES_APART = 3600.0
-"""s between the files of a folder, and longer than all of them together: they are of several drives."""
+"""s between two files of a folder beyond which they are of several drives, if it is also longer than all files."""
 
 
 @dataclass(frozen=True, eq=False)

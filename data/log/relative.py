@@ -17,8 +17,8 @@ UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE_RATIO, NARROW_RATIO = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
 MAX_ANGLE_STD, MIN_STD_SHARE = 0.5, 1e-3
-"""rad: no sensor's angles scatter as much about positions that are better known; least share of a stated deviation that
-is offered, as to numbers without noise."""
+"""rad, largest standard deviation of angles that is offered; least share of a stated one that is offered instead: of
+numbers without noise it would be 0."""
 HINTS = {
     "range": "Are clocks, or the positions of one, off?",
     "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "

@@ -18,7 +18,7 @@ from .read import Log
 TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 """m and rad, of first poses that the truth gives."""
 GATE_STDS = 5.0
-"""Of the pose filters that check a log: standard deviations beyond which a measurement is left out."""
+"""Standard deviations of an innovation beyond which the pose filters that check a log leave a measurement out."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ class Kind(NamedTuple):
     Attributes:
         group: fix, odometry, heading, relative or message.
         name: of the same quantity in SI units.
-        limit: largest |value| in its own unit that can be meant; beyond it another unit is.
+        limit: largest plausible |value| in its own unit; beyond it the unit is another one.
         scale: in SI it is scale * value + offset.
         offset: rad.
     """
@@ -54,11 +54,11 @@ KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float
 LIMITS = {name: kind.limit for name, kind in KINDS.items()}
 LEAST_VALUES = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 MOST_CODES, LEAP_RATIO, LEAST_MEANT = 3, 1.4, 10
-"""Most numbers of a kind that stand for none, and times the largest that can be meant beyond which they are; least rows
-of one that could be meant, and times the usual step from one range of a pair to the next that is a leap."""
+"""Codes for "not measured": most different ones of a kind; ratio to the largest plausible value beyond which a value
+is one, and, of a value that is plausible, its least rows and the ratio to a pair's usual step that makes a leap."""
 VAGUE, NONSENSE = 30.0, 50.0
-"""Times the usual standard deviation of a vehicle's kind, from which the largest, if it repeats, says that there was no
-measurement (squared, also if it does not), and the least that does, whatever the unit: fixes may be of 2 cm or 5 m."""
+"""Ratio to the usual standard deviation of a vehicle's kind from which the largest one, if it repeats, means "not
+measured" (the square of it, if it does not), and the least that can, in any unit: fixes may be of 2 cm or 5 m."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
 DECIMAL = " Degrees are decimal: scale=latitude:1e-7,longitude:1e-7 of integers, 48.1173 for 4807.04 of NMEA."
 UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."

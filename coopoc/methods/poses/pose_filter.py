@@ -258,15 +258,15 @@ class PoseFilter:
 
 
 def pose_start(recording: Recording, *, seconds: float = START_SECONDS, gate: float = START_GATE) -> Floats:
-    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN of landmarks and who is absent.
+    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks and absent vehicles.
 
-    With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
-    odometry until then its pose at the first step; or, by least squares, its ranges to three landmarks or more. A solo
-    filter starts from each of some headings around the circle, then around the best; the one whose innovations, and
-    bearings of other vehicles from fix to fix, have the largest likelihood over the first seconds is kept, and odometry
-    leads back from where that is surest. A compass
-    leaves one. Vehicles without a fix that see fewer than two landmarks come last: for them those that were found
-    before are places, too.
+    A heading and the first fix, or the first range and bearing of a landmark, give a vehicle's pose there, and the
+    odometry until then gives its pose at the first step; so do, by least squares, ranges to three landmarks or more.
+    Headings around the circle are tried, then headings around the best: a solo filter starts from each, and the one
+    with the largest likelihood of its innovations, and of bearings of other vehicles from fix to fix, is kept. Its
+    estimate of least variance, moved back by odometry, gives the first pose. With a compass only its heading is tried.
+    Vehicles without a fix that measure fewer than two landmarks come last: vehicles with a pose then count as
+    landmarks.
 
     Args:
         recording: in body frames.
