@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Outliers, Recording, Sensors, observe
-from coopoc.arrays import Bools, number, one_of, seed_of
+from coopoc.arrays import Bools, one_of, runs_in_memory, seed_of
 from coopoc.data.source import split, there
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
@@ -249,7 +249,7 @@ def facts(p: Params) -> Mapping[str, str]:
         InputError: parameters that no cell can be computed with.
     """
     sensors(p), attacking(p), channel(p), start(p), egos(p)
-    number("runs", p.get("runs", 1), 1, kind=int, allowed=">= 1", hint="Give the number of noise draws.")
+    runs_in_memory(p.get("runs", 1), 8 * fleet(p["data"]).present.size)
     seed_of(p.get("seed", 0))
     return {"code": revision(*CODE), **_digests(p["data"])}
 

@@ -170,6 +170,7 @@ def test_settings_of_studies_name_presets_and_rates():
     assert (found.fixes, found.ranges) == (Outliers.urban_canyon().fixes, Outliers.uwb_nlos().ranges)
     assert found.angles == Fault(0.01)
     assert Outliers.named("ranges=0.05:2").ranges == Fault(0.05, (3.0, 20.0), lasts=2.0)
+    assert Outliers.named("fixes=0.05").fixes == Fault(0.05, (10.0, 50.0), lasts=10.0)
     assert found.odometry.rate == 0
     assert found.notes == (  # the shares, sizes and times of the sources in the docstrings
         "5 % of the ranges 0.3 to 0.42 m too long, exponential, for 0.5 s",
