@@ -282,6 +282,15 @@ def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():
     assert from_graph(replace(graph, pose_prior=prior)).fixed == (0, 80)
 
 
+@pytest.mark.parametrize("start", ["auto", "odometry", "tree", "incremental"])
+def test_fixed_vertices_stay_where_the_file_has_them(start):
+    """Of one robot, the next and a landmark; from the vertices, which hold the truth, the cost is as low."""
+    graph = replace(random_graph(5, loops=6, ranges=0), fixed=[0, 30, 90, 120])
+    found = solve(from_graph(graph, start=start))
+    assert np.array_equal(found.position[graph.fixed], graph.position[graph.fixed])
+    assert found.cost == pytest.approx(solve(from_graph(graph, start="file")).cost)
+
+
 def test_where_gtsams_optimizer_does_not_arrive_it_is_said():
     """Lengths in micrometres: GTSAM's least damping is one of the unit metre, and its Levenberg-Marquardt creeps.
     Referee: the minimum, which does not depend on the unit."""

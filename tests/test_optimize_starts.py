@@ -14,12 +14,14 @@ from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Loss, Problem, Solution, solve, solve_gnc
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph
+from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
 from coopoc.optimize.starts.graph_starts import tree, walk
 from coopoc.optimize.starts.windings import rewound
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from random_graphs import random_graph
 from unseen_graphs import lost, ranged_drives, world
 
 
@@ -219,6 +221,21 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
     ):
         wound = rewound(problem, space.join(np.zeros((2000, 2)), exp(turns[:, None])), 0.0)
         assert (next(wound, None) is None) is expected
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@pytest.mark.parametrize(("d", "seed"), [(2, 315), (3, 303)])
+def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, backend):
+    """Costs that noise may explain lead from there, 49 for 25 and 34 for 21: without a note before."""
+    graph, rng = (
+        random_graph(seed, d, 1, loops=8, landmarks=0, ranges=0, seen=0, turn_std=0.3),
+        np.random.default_rng(0),
+    )
+    truth = from_graph(graph, "geodesic", start="file")
+    far = truth.space.retract(truth.x0, 2 * rng.normal(size=truth.movable.shape) * truth.movable)
+    found = solve(replace(truth, x0=far, search=Search()), backend)
+    assert found.cost <= solve(truth).cost * (1 + 1e-6)
+    assert "x0 leads to a higher minimum" in found.notes[-1]
 
 
 def test_a_search_takes_few_steps_of_the_whole(monkeypatch):

@@ -21,6 +21,7 @@ from .starts.graph_starts import (
     STARTS,
     contenders,
     incremental_start,
+    known,
     parts,
     position_variance,
     rotation_variance,
@@ -104,7 +105,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
 
 
-def _raced(graph: Graph, problem: Problem, draws: bool = False) -> tuple[Problem, Search]:
+def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | None = None) -> tuple[Problem, Search]:
     """The race of what a graph offers; the problem starts at chained odometry."""
     starts: dict[str, Callable[[], Floats]] = {
         name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
@@ -116,24 +117,25 @@ def _raced(graph: Graph, problem: Problem, draws: bool = False) -> tuple[Problem
         if len(graph.ranges):
             late["eased"] = partial(eased, start=np.asarray(problem.x0))
         late["incremental"] = lambda _: incremental_start(graph, problem)
-    return race(problem, starts, late, "incremental" if len(graph.ranges) else "", draws)
+    return race(problem, starts, late, "incremental" if len(graph.ranges) else "", draws, end)
 
 
-def started(problem: Problem) -> Problem:
-    """A problem of poses without an x0 from where what it measures leads lowest; any other as it is.
+def started(problem: Problem, end: Floats | None = None) -> Problem:
+    """A problem of poses without an x0 from where what it measures leads lowest, and one with an x0 from there if that
+    is lower than the `end` (n, ambient) of its x0; any other as it is.
 
     >>> from coopoc.optimize import pose
     >>> problem = Problem(("here", "there"), dimension=2, poses=(0, 1)).add("pose", "here", pose([1.0, 2.0]), std=0.1)
     >>> started(problem.add("relative_pose", ("here", "there"), pose([3.0, 0.0]), std=0.1)).x0[1, :2]
     array([4., 2.])
     """
-    if not problem.poses or problem.x0 is not None:
+    if not problem.poses or (problem.x0 is not None and end is None):
         return problem
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
         at = problem.replace_unchecked(x0=frozen(directed(problem, _x0(graph, problem.poses, "odometry"))))
-        at, won = _raced(graph, at, True)
+        at, won = _raced(graph, at, True, end)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
@@ -152,7 +154,8 @@ def _counted(notes: Sequence[str]) -> list[str]:
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
     """(n, ambient) of a start that needs no search."""
-    x0 = STARTS[name](graph)
+    x0, still = STARTS[name](graph), known(graph)
+    x0[still] = Space(graph.dimension, has_rotation=True).join(graph.position[still], graph.rotation[still])
     return x0 if poses else x0[:, : graph.dimension]
 
 

@@ -9,10 +9,11 @@ import numpy as np
 from ..arrays import Floats, instance
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock, load, spent
-from .algebra.sparse import LIBRARIES
+from .algebra.sparse import LIBRARIES, sparse
 from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, SolverResult, require_backend
+from .descent.levenberg_marquardt import arrive
 from .graph_problems import started
 from .model.factor import fused
 from .model.measurements import CONVERTED
@@ -21,7 +22,19 @@ from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import directed, guessed, somewhere, undirected
 from .starts.mirrors import scaled
-from .starts.race import ELSEWHERE, QUIET_DRAWS, doubts, drawn, race, scattered
+from .starts.race import (
+    ELSEWHERE,
+    FIRST_STEPS,
+    QUIET_DRAWS,
+    RACE_TOLERANCE,
+    doubts,
+    drawn,
+    higher,
+    race,
+    reached_once,
+    scattered,
+    smooth,
+)
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -99,6 +112,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     load(*LIBRARIES)
     began, earlier = clock(), problem.search.seconds
     backend.check(problem, options)
+    given = problem.poses and problem.x0 is not None and not problem.search.start and not problem.constraints
     problem = started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
@@ -114,6 +128,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     result = backend.run(problem, start, options)
     if searching and constraints:
         problem, result = _drawn(problem, backend, options, result)
+    elif given:
+        problem, result = _challenged(problem, backend, options, result)
     search = problem.search
     solved = clock()
     x, iterations = result.x, result.iterations
@@ -178,6 +194,28 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
         steps, start, first = steps + first.iterations, "drawn", backend.run(problem, x, options)
     search = search._replace(start=start, iterations=search.iterations + steps, notes=notes)
     return problem.replace_unchecked(search=search), first
+
+
+def _challenged(
+    problem: Problem, backend: Backend, options: Options, first: SolverResult
+) -> tuple[Problem, SolverResult]:
+    """The result from a given x0 of poses; where the way from there was not `smooth`, the lower of it and that from
+    where the measurements lead, which a note names."""
+    system, record = sparse(problem), first.extras.get("record")
+    if record is None:
+        record = arrive(system, np.asarray(problem.x0), FIRST_STEPS, RACE_TOLERANCE, smooth=True).record
+    cost = system.cost(first.x)
+    if smooth(record) or not np.isfinite(cost):
+        return problem, first
+    other = started(problem, first.x)
+    search, least = other.search, system.cost(np.asarray(other.x0))
+    search = search._replace(iterations=search.iterations + first.iterations)
+    if higher(cost, least):
+        note = f"x0 leads to a higher minimum, of cost {cost:.4g}: start {search.start!r} led here"
+        other = other.replace_unchecked(search=search._replace(notes=(*search.notes, note)))
+        return other, backend.run(other, np.asarray(other.x0), options)
+    notes = reached_once([cost, least], cost) if higher(least, cost) else search.notes
+    return problem.replace_unchecked(search=problem.search._replace(notes=notes)), first
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:

@@ -258,9 +258,11 @@ def _own(graph: Graph) -> Bools:
 
 
 def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
-    """Poses with a prior at that, then each robot's first, and the first of each part that its odometry joins."""
+    """Fixed poses, those with a prior at that, then each robot's first, and the first of each part that its odometry
+    joins."""
     priors, poses = graph.pose_prior, np.flatnonzero(graph.is_pose)
-    roots = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
+    roots = [(int(i), graph.position[i], graph.rotation[i]) for i in known(graph) if graph.is_pose[i]]
+    roots += [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
     part = parts(len(graph.names), graph.relative_pose.nodes[_own(graph)])[poses]
     _, first, count = np.unique(part, return_index=True, return_counts=True)
     robots = [int(places[0]) for places in graph.robots.values()]
@@ -277,10 +279,16 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     return roots
 
 
+def known(graph: Graph) -> Ints:
+    """Fixed vertices of which the graph has the place."""
+    return graph.fixed[np.isfinite(graph.position[graph.fixed]).all(axis=1)]
+
+
 def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
-    """Nodes with the points at their priors, where a pose sees them, or by ranges."""
-    points = graph.point_prior
+    """Nodes with the points where they are fixed, at their priors, where a pose sees them, or by ranges."""
+    points, still = graph.point_prior, known(graph)
     position[points.nodes[:, 0]], placed[points.nodes[:, 0]] = points.position, True
+    position[still], rotation[still], placed[still] = graph.position[still], graph.rotation[still], True
     for (i, j), at in zip(graph.relative_point.nodes.tolist(), graph.relative_point.position, strict=True):
         if not placed[j]:
             position[j], placed[j] = position[i] + rotation[i] @ at, True
@@ -331,6 +339,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
             if joins[point] and len(others) >= 2 * ranges[point]:
                 x[point, : space.dimension] = trilaterate(x[others, : space.dimension], distance)
                 ranges[point] = len(others)
+        x[list(problem.fixed)] = problem.x0[list(problem.fixed)]
         before, solved = solved, used | joins
         free = solved & (~before | last | ~graph.is_pose)
         last = solved & ~before

@@ -27,7 +27,7 @@ UNMEASURED_WEIGHT = 1e-9
 
 
 def graph_of(problem: Problem) -> Graph:
-    """The graph of what a problem measures; what a graph has no edge for is left out.
+    """The graph of what a problem measures, and of where it fixes nodes; what a graph has no edge for is left out.
 
     >>> problem = Problem(("here", "there"), dimension=2, poses=(0,)).add("position", "there", [3.0, 4.0], std=1.0)
     >>> graph_of(problem.add("range", ("here", "there"), 5.0, std=0.1))
@@ -44,11 +44,15 @@ def graph_of(problem: Problem) -> Graph:
     for field, own in rows.items():
         nodes, values, covariance = map(np.concatenate, zip(*own, strict=True))
         edges[field] = edges_of(field, nodes, values, covariance, ())
-    names = problem.names
+    names, still = problem.names, list(problem.fixed)
+    at, orientation = np.full((n, d), np.nan), np.full((n, 1 if d == 2 else 4), np.nan)
+    if problem.x0 is not None and problem.poses:
+        held = problem.x0[still]
+        at[still], orientation[still] = problem.space.position(held), to_orientation(problem.space.rotation(held))
     if not all(map(NAME.fullmatch, names)):
         part = parts(n, *(nodes for nodes, *_ in rows["relative_pose"]))
         names = tuple(f"{chr(65 + part[k] % 26)}{k}" for k in range(n))
-    return Graph(d, names, poses, np.full((n, d), np.nan), np.full((n, 1 if d == 2 else 4), np.nan), **edges)  # type: ignore[arg-type]
+    return Graph(d, names, poses, at, orientation, fixed=still, **edges)  # type: ignore[arg-type]
 
 
 def along_poses(problem: Problem) -> Floats:
@@ -61,7 +65,6 @@ def along_poses(problem: Problem) -> Floats:
     roots = [(k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses)]
     position, rotation, placed = walk(graph, np.ones(len(graph.relative_pose), dtype=bool), roots)
     position[~placed], rotation[~placed] = space.position(x[~placed]), space.rotation(x[~placed])
-    placed[list(problem.fixed)] = True
     return with_points(graph, position, rotation, placed)[:, : space.ambient]
 
 

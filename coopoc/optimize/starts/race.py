@@ -47,6 +47,7 @@ def race(
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     grown: str = "",
     draws: bool = False,
+    reached: Floats | None = None,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
@@ -63,9 +64,11 @@ def race(
         late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
         grown: which of the late starts is tried first where no other went straight.
         draws: whether points and bodies are started from random places, too.
+        reached: (n, ambient) the end of the descent from an x0, which competes.
     """
     system, taken, arrived = sparse(problem), 0, True
-    tried, straight, late = dict[str, tuple[float, Floats]](), set[str](), dict(late)
+    tried = dict[str, tuple[float, Floats]]() if reached is None else {"x0": (system.cost(reached), reached)}
+    straight, late = set[str](), dict(late)
     rough, calm, minima = list[str](), list[float](), list[float]()
     mean, variance = expected(problem, system.size)
     usual = EXCESS_STDS * np.sqrt(variance)
@@ -107,7 +110,7 @@ def race(
         far = name not in straight and system.cost(x) > limit
         x, moves, others = across(problem, x, descend, system.cost, far)
         name, cost = name + ", moved" * (moves > 0), system.cost(x)
-        costs = [each for each, _ in (*tried.values(), *ends)] + [cost] * (moves > 0)
+        costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
         others += [(each, x) for each in minima]
         ends += [end for end in others if higher(end[0], cost, SAME_COST) or not higher(end[0], cost)]
         notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
@@ -117,7 +120,7 @@ def race(
     relative = relative and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
     for name, start in starts.items():
         end, cost = attempt(name, directed(problem, start()), FIRST_STEPS, True), tried[name][0]
-        if not smooth(end):
+        if not smooth(end.record):
             rough.append(name)
         else:
             calm.append(cost)
@@ -197,10 +200,10 @@ def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
     return x, taken
 
 
-def smooth(end: Arrival) -> bool:
-    """Whether the gain ratio of every step was within 1/2 .. 3/2, without damping. An exact Hessian that was not
-    positive definite does not count: J^T J goes on from there."""
-    _, damping, gain = end.record.T
+def smooth(record: Floats) -> bool:
+    """Whether the gain ratio of every step of an Arrival was within 1/2 .. 3/2, without damping. An exact Hessian that
+    was not positive definite does not count: J^T J goes on from there."""
+    _, damping, gain = record.T
     return bool(not damping.any() and (np.abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
 
 

@@ -62,4 +62,6 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
         bent[k] -= 2.0 * np.pi * left[k] / max(size[k], BRIDGE)
         rotation = exp(turns(bent)) @ turned
         gap = at[j] - at[i] - (rotation[i] @ edges.position[..., None])[..., 0]
-        yield space.join(at + places(gap), rotation)
+        y = space.join(at + places(gap), rotation)
+        y[list(problem.fixed)] = x[list(problem.fixed)]
+        yield y
