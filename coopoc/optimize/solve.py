@@ -27,6 +27,7 @@ from .starts.race import (
     FIRST_STEPS,
     QUIET_DRAWS,
     RACE_TOLERANCE,
+    RIVAL_COST,
     doubts,
     drawn,
     higher,
@@ -199,13 +200,14 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
 def _challenged(
     problem: Problem, backend: Backend, options: Options, first: SolverResult
 ) -> tuple[Problem, SolverResult]:
-    """The result from a given x0 of poses; where the way from there was not `smooth`, the lower of it and that from
-    where the measurements lead, which a note names."""
+    """The result from a given x0 of poses; where the way from there was long and not `smooth`, the lower of it and that
+    from where the measurements lead, which a note names."""
     system, record = sparse(problem), first.extras.get("record")
     if record is None:
         record = arrive(system, np.asarray(problem.x0), FIRST_STEPS, RACE_TOLERANCE, smooth=True).record
     cost = system.cost(first.x)
-    if smooth(record) or not np.isfinite(cost):
+    near = not np.isfinite(cost) or smooth(record) or record[0, 0] - cost <= RIVAL_COST
+    if near or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
     other = started(problem, first.x)
     search, least = other.search, system.cost(np.asarray(other.x0))
