@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopoc import Fleet, InputError
-from coopoc.formats import trajectories as tum
+from coopoc.formats.values import read_table as read_rows
 from coopoc.paths import write
 from coopoc.text import spreadsheet
 
@@ -75,20 +75,21 @@ def read_tum(path: Path, **options: Any) -> Fleet:
     """Fleet of a TUM file or a folder of them; ids are file names, velocity is the backward difference.
 
     Args:
-        path: file or folder; s and m; orientation is checked for a unit quaternion and not kept (a Fleet has none).
+        path: file or folder; `t x y z qx qy qz qw`, s and m; the orientation is not kept.
         options: dt (s, resample: needed when the vehicles' stamps differ), max_gap and any_scale, as of `assemble`.
 
     Raises:
-        InputError: no file, or what `coopoc.formats.trajectories.read_tum` raises.
+        InputError: no file; with the line, another number of words, one that is no finite number; what `assemble`
+            raises.
     """
     files = tum_files(path)
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
-    poses = [tum.read_tum(file) for file in files]
-    ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in track.stamps]
-    t, x = (np.concatenate([getattr(track, field) for track in poses]) for field in ("stamps", "position"))
+    tables = [read_rows(file, "t x y z qx qy qz qw")[1] for file in files]
+    ids = [file.stem for file, table in zip(files, tables, strict=True) for _ in table]
+    t, *x = np.concatenate(tables)[:, :4].T
     source = f"TUM {path.name}, velocity by backward difference"
-    return assemble(ids, t, x, **options, file=path.name, name=path.stem, source=source)
+    return assemble(ids, t, np.stack(x, axis=1), **options, file=path.name, name=path.stem, source=source)
 
 
 def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Fleet:

@@ -1,4 +1,4 @@
-"""PyFG, g2o and TUM files: what comes back, and what CORA's matrices, GTSAM and SciPy say of it."""
+"""PyFG and g2o files: what comes back, and what CORA's matrices, GTSAM and SciPy say of it."""
 
 import time
 from dataclasses import fields, is_dataclass, replace
@@ -15,12 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from coopoc.formats import load_graph
 from coopoc.formats.graph import ENDS, Graph, PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.trajectories import Trajectory, read_tum
 from coopoc.formats.values import to_orientation, to_rotation
 
 
 def assert_same(a: Any, b: Any, rtol: float = 0):
-    """Every field of two graphs or trajectories is equal, NaN to NaN; covariances to rtol."""
+    """Every field of two graphs is equal, NaN to NaN; covariances to rtol."""
     for field in fields(a):
         one, two = getattr(a, field.name), getattr(b, field.name)
         if is_dataclass(one):
@@ -230,22 +229,3 @@ def test_rotations_are_scipys():
     assert (to_orientation(turned.as_matrix())[:, 3] >= 0).all()
     theta = np.linspace(-3.1, 3.1, 50)[:, None]
     assert_allclose(to_orientation(to_rotation(theta)), theta, atol=1e-15)
-
-
-def random_trajectory(count: int = 40) -> Trajectory:
-    rng = np.random.default_rng(2)
-    stamps = 1.6e9 + np.cumsum(rng.uniform(0.01, 0.2, count))
-    return Trajectory(
-        stamps, np.cumsum(rng.normal(size=(count, 3)), axis=0), Rotation.random(count, rng=rng).as_matrix()
-    )
-
-
-def test_a_tum_file_is_numpys_table(tmp_path):
-    """Independent check: SciPy's rotations of the quaternions that NumPy writes."""
-    poses = random_trajectory()
-    quaternion = Rotation.from_matrix(poses.rotation).as_quat()
-    np.savetxt(tmp_path / "a.tum", np.c_[poses.stamps, poses.position, quaternion], fmt="%.17g")
-    again = read_tum(tmp_path / "a.tum")
-    assert_array_equal(again.stamps, poses.stamps)
-    assert_array_equal(again.position, poses.position)
-    assert_allclose(again.rotation, poses.rotation, atol=1e-15)

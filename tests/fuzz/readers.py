@@ -11,7 +11,6 @@ from coopoc import read_graph
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.formats.seals import UNSEALED, sealed
-from coopoc.formats.trajectories import read_tum
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
 from coopoc.study import publish, reference
@@ -59,7 +58,6 @@ READERS: Mapping[str, Reader] = {
     "csv resampled": Reader({"a.csv": good.TABLE}, lambda d: load_fleet(d / "a.csv", dt=0.1)),
     "fcd": Reader({"a.xml": good.FCD}, lambda d: load_fleet(d / "a.xml")),
     "tum": Reader({"a.tum": good.TUM}, lambda d: load_fleet(d / "a.tum")),
-    "tum poses": Reader({"a.tum": good.TUM}, lambda d: read_tum(d / "a.tum")),
     "g2o": Reader({"a.g2o": good.G2O}, lambda d: read_graph(d / "a.g2o")),
     "pyfg": Reader({"a.pyfg": good.PYFG}, lambda d: read_graph(d / "a.pyfg")),
     "pyfg recording": Reader({"a.pyfg": good.ROBOTS}, lambda d: load_log(d / "a.pyfg")),
