@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, inside, part
+from ..compiling.compile import compiled, inside
 
 PANEL = 16
 """Rows of a front that are eliminated before one product updates the others of their block."""
@@ -188,35 +188,21 @@ def eliminate(front: Floats, c: int) -> bool:
         by_loops = (end - outer) * (m - outer) ** 2 < WORTH
         for panel in range(outer, end, PANEL):
             stop = min(panel + PANEL, end)
-            for first in range(panel, stop, 4):
-                last = min(first + 4, stop)
-                for k in range(first, last):
-                    if not front[k, k] > 0.0:
-                        return False
-                    share = 1.0 / np.sqrt(front[k, k])
-                    for i in range(k, m):
-                        front[k, i] *= share
-                    for j in range(k + 1, last):
-                        share = front[k, j]
-                        for i in range(j, m):
-                            front[j, i] -= share * front[k, i]
-                by_four(front, first, last, m if by_loops else stop)
+            for k in range(panel, stop):
+                if not front[k, k] > 0.0:
+                    return False
+                share = 1.0 / np.sqrt(front[k, k])
+                for i in range(k, m):
+                    front[k, i] *= share
+                for j in range(k + 1, m if by_loops else stop):
+                    share = front[k, j]
+                    for i in range(j, m):
+                        front[j, i] -= share * front[k, i]
             if not by_loops:
                 downdate(front, panel, stop, end)
         if not by_loops:
             downdate(front, outer, end, m)
     return True
-
-
-@part
-def by_four(front: Floats, first: int, last: int, end: int) -> None:
-    """`downdate` of up to four rows, without BLAS."""
-    p, q, r = min(first + 1, last - 1), min(first + 2, last - 1), min(first + 3, last - 1)
-    for j in range(last, end):
-        a, b = front[first, j], front[p, j] if p > first else 0.0
-        c, d = front[q, j] if q > p else 0.0, front[r, j] if r > q else 0.0
-        for i in range(j, len(front)):
-            front[j, i] -= a * front[first, i] + b * front[p, i] + c * front[q, i] + d * front[r, i]
 
 
 @compiled
