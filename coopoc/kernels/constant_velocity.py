@@ -17,13 +17,13 @@ from ..arrays import Floats
 from .compiling.compile import compiled
 
 BANK = 0.02 * 1.6 ** np.arange(16)
-"""w, from a straight road at a steady speed to fixes that hardly depend on each other."""
+"""w of each filter: from a straight road at a steady speed to fixes that hardly depend on each other."""
 FIRST_FILTER = 6
-"""Which of them holds before anything was seen."""
+"""Index of the filter that holds before the first innovation."""
 REMEMBERS = 30.0
-"""s, in which what filters have predicted is forgotten."""
+"""s, time constant of the filters' log likelihoods."""
 PRIOR_COUNT = 6.0
-"""Numbers that R, as it is stated, counts as."""
+"""Innovations that the stated R counts as, beside the measured ones."""
 MIN_VARIANCE = 1e-12
 """m^2, least R."""
 CLIP_STDS = 3.0

@@ -16,9 +16,9 @@ from .stars.messages import BLOCK, block_at, vector_at
 MAX_CORRELATION2 = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
 TOGETHER, DOUBT = 5, 36.0
-"""Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond
-HARD_REJECT_FACTOR of it; and the square of their normalised mean, of three degrees of freedom, that chance does not
-reach."""
+"""Numbers in a row that are judged together: they contradict the track where all are beyond FIX_GATE, those of
+neighbours beyond HARD_REJECT_FACTOR times it; and the squared normalised mean of such a row, of three degrees of
+freedom, that chance does not reach."""
 
 
 @compiled

@@ -8,7 +8,7 @@ from .motion import MotionNoise, keep_pace, process_variance
 from .odometry_fault import correct, judge
 
 ROUNDING = 1e-9
-"""s, by how much sums of time steps may miss a time."""
+"""s, rounding error of a sum of time steps."""
 ESTIMATE, NO_FIX_YET, BAD_INPUT = 0, 1, 2
 """What a step of a stream returns."""
 VELOCITY, DT, FIX_AGE = slice(3, 6), 6, 7

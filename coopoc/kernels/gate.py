@@ -35,30 +35,30 @@ from .compiling.vectors import Lanes, choose
 GATE, FIX_GATE = 9.0, 12.0
 """Squared normalised innovation of a number, and of a position, from which it weighs less."""
 HARD_REJECT_FACTOR = 2.0
-"""Gates beyond which it weighs nothing."""
+"""Multiple of the gate beyond which a measurement weighs nothing."""
 PATIENCE = 5.0
-"""Sum of the gains of measurements beyond the gate from which it is the filter that is wrong."""
+"""Sum of the gains of rejected measurements above which gating is suspended."""
 LEAK = 0.5
-"""Share of its gain that a measurement within the gate takes from that sum: those of a filter that is wrong are not
-all beyond."""
+"""Share of its gain by which a measurement within the gate lowers that sum: a wrong filter does not reject every
+one."""
 INITIAL_LOCKOUT = 4.8
-"""That sum at the start of a pose or of a relative vector, which a wrong heading or a wrong first measurement may have
-placed: the next ones that contradict it are believed. Of a position it is 0, since fixes err together."""
+"""That sum at the start of a pose or of a relative vector: a wrong heading or a wrong first measurement may have placed
+it, so the next ones that contradict it are believed. Of a position it is 0, since fixes err together."""
 SLIP = 0.25
-"""m^2, what wheels that slip, or a speed that was measured too low, may add to an error on each axis: however precise
-fixes are, less is no sign of a wrong one."""
+"""m^2, variance on each axis that slipping wheels, or a speed that was measured too low, may add to an error: a smaller
+innovation is no sign of a wrong fix, however precise fixes are."""
 AWAY = 0.5
-"""Sum of the gains of fixes within the gate from which a filter has gone wherever fixes draw it: a position that is
-remembered as less far away than it is uncertain is then forgotten."""
+"""Sum of the gains of accepted fixes from which they, and not the remembered position, have placed the filter: that
+position is then forgotten if it is less far away than it is uncertain."""
 EVIDENCE = 2.0
-"""Rejected fixes that it takes to go back: by how much more the squared normalised innovations of the filter are, none
-more than that of a fix that is just rejected, than those of the position that is remembered."""
+"""Rejected fixes that it takes to go back: least excess of the filter's squared normalised innovations, each at most
+that of a fix that is just rejected, over those of the remembered position."""
 NOTHING = 1e30
 """m^2, variance of a position that is not remembered."""
 FORGET, KEEP, BEGIN, BACK, ANEW = -1.0, 0.0, 1.0, 2.0, 3.0
 """What `remember` returns, and that a start is left."""
 CONFIRMED = 5.0
-"""Fixes that agree with a start, itself among them, from which it is right."""
+"""Fixes that agree with a start, itself included, from which the start counts as right."""
 MOST = HARD_REJECT_FACTOR * FIX_GATE
 """Squared normalised distance of two fixes, up to which they agree."""
 UNSEEN = 1e15

@@ -31,15 +31,16 @@ WAY, SINCE, FIX, GAPS, TIMES, COUNT, BASE, RATIO, FLOOR, INTERVAL, SIZE = 19, 21
 way m, and of their times s, and how many there were; and, all the time, the numbers of a MotionNoise, base and
 ratio squared."""
 TOGETHER = 0.4
-"""s, of which fixes are taken together."""
+"""s, interval whose fixes are averaged into one."""
 JERKY = 1.0
 """m^2/s^3, density of the acceleration of b."""
 RESTART_Q, MAX_Q = 14.0, 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
 DECISIVE, MAX_EVIDENCE = 15.0, 18.0
-"""Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
+"""Evidence, a log likelihood ratio, from which the odometry fails, and the most that is counted."""
 ERRS_SHARE, ERRS_RATE, ERRS_STDS, ERRS_SECONDS = 0.2, 0.5, 5.0, 2.0
-"""Of the way, m for each second, and deviations of a fix: it errs by as much at least, for as many s."""
+"""Least error of an odometry that fails, as a share of the way, in m for each second, and in standard deviations of a
+fix; and s for which it must last."""
 FASTER = 4.0
 """Times the fastest by odometry that a vehicle may go, if that is above ERRS_RATE: m/s for km/h make it 3.6."""
 WANDERS = 2.0

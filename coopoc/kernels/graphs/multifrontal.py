@@ -21,7 +21,7 @@ PANEL = 16
 BLOCK = 128
 """Rows of a block, after which one product updates the rest: wide enough for BLAS to be fast."""
 WORTH = 200_000
-"""Multiplications from which a call of BLAS is faster than loops."""
+"""Multiplications from which a call of BLAS is faster than our loops."""
 STRIP = 64
 """Rows that one product updates: below the diagonal it would compute what nothing reads."""
 
