@@ -65,8 +65,8 @@ tile: Any = intrinsic(_tile)
 
 
 def _emit(build: Any, shape: tuple[int, int], blocks: Any, across: Any, depth: Any, floor: Any) -> None:
-    """One tile; with few sums, several terms of each are added at once, because a sum waits for its last term."""
-    cells, terms = [(r, v) for r in range(shape[0]) for v in range(shape[1])], max(1, 8 // (shape[0] * shape[1]))
+    """One tile."""
+    cells = [(r, v) for r in range(shape[0]) for v in range(shape[1])]
     count, word = REGISTER_BYTES // (4 if isinstance(floor.type, ir.FloatType) else 8), depth.type
     vector, lane = ir.VectorType(floor.type, count), ir.IntType(32)
     out, a, b, start = blocks
@@ -82,30 +82,15 @@ def _emit(build: Any, shape: tuple[int, int], blocks: Any, across: Any, depth: A
         first = build.insert_element(ir.Constant(vector, ir.Undefined), value, lane(0))
         return build.shuffle_vector(first, first, ir.Constant(ir.VectorType(lane, count), [0] * count))
 
-    def add(k: Any, u: int) -> None:
+    sums = {cell: cgutils.alloca_once_value(build, load(start, word(cell[0]), cell[1])) for cell in cells}
+    with cgutils.for_range_slice(build, word(0), depth, word(1), inc=True) as (k, _):
         loaded = [load(b, k, v) for v in range(shape[1])]
         factors = [splat(build.load(place(a, word(r), build.mul(k, across), floor.type))) for r in range(shape[0])]
         for r, v in cells:
-            term, total = build.fmul(factors[r], loaded[v], flags=("contract",)), sums[u, r, v]
-            build.store(build.fadd(build.load(total), term, flags=("contract",)), total)
-
-    zero = ir.Constant(vector, None)
-    begins = [[load(start, word(r), v) if u == 0 else zero for r, v in cells] for u in range(terms)]
-    sums = {
-        (u, *cell): cgutils.alloca_once_value(build, row[i])
-        for u, row in enumerate(begins)
-        for i, cell in enumerate(cells)
-    }
-    whole = build.sub(depth, build.urem(depth, word(terms)))
-    with cgutils.for_range_slice(build, word(0), whole, word(terms), inc=True) as (k, _):
-        for u in range(terms):
-            add(build.add(k, word(u)), u)
-    with cgutils.for_range_slice(build, whole, depth, word(1), inc=True) as (k, _):
-        add(k, 0)
+            term = build.fmul(factors[r], loaded[v], flags=("contract",))
+            build.store(build.fadd(build.load(sums[r, v]), term, flags=("contract",)), sums[r, v])
     for r, v in cells:
-        total = build.load(sums[0, r, v])
-        for u in range(1, terms):
-            total = build.fadd(total, build.load(sums[u, r, v]))
+        total = build.load(sums[r, v])
         result = build.select(build.fcmp_ordered("<", total, splat(floor)), splat(floor), total)
         build.store(result, place(out, word(r), word(v * count)), align=4)
 
