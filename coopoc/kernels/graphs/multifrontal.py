@@ -258,7 +258,7 @@ def selected_inverse(fronts: Fronts, factor: Floats) -> Floats:
         _, c, m = shape(fronts, s)
         block = factor[fronts.start[s] : fronts.start[s + 1]].reshape(c, m)
         own = inverse[fronts.start[s] : fronts.start[s + 1]].reshape(c, m)
-        root, rows = triangular_inverse(block), fronts.rows[fronts.row[s] : fronts.row[s + 1]]
+        root, rows = np.linalg.inv(np.triu(block[:, :c])), fronts.rows[fronts.row[s] : fronts.row[s + 1]]
         own[:, :c] = np.dot(root, root.T)
         if m == c:
             continue
@@ -278,22 +278,6 @@ def selected_inverse(fronts: Fronts, factor: Floats) -> Floats:
         own[:, c:] = -beside
         own[:, :c] += np.dot(beside, weight.T)
     return inverse
-
-
-@compiled
-def triangular_inverse(block: Floats) -> Floats:
-    """U^-1 (c, c) of the upper triangle U that a block (c, m) begins with."""
-    c = len(block)
-    root = np.zeros((c, c))
-    for i in range(c - 1, -1, -1):
-        share = 1.0 / block[i, i]
-        for k in range(i + 1, c):
-            for j in range(k, c):
-                root[i, j] -= block[i, k] * root[k, j]
-        for j in range(i + 1, c):
-            root[i, j] *= share
-        root[i, i] = share
-    return root
 
 
 @compiled
