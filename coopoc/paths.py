@@ -10,7 +10,6 @@ from typing import Any
 
 from .errors import InputError, shown
 
-_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{digit}" for port in ("COM", "LPT") for digit in range(1, 10))}
 _LONGEST = 200
 
 
@@ -34,7 +33,7 @@ def given_path(path: object) -> Path:
 
 
 def file_name(field: str, name: object, hint: str) -> str:
-    """`name`, if it is a valid file name on Linux, macOS and Windows.
+    """`name`, if it is a valid file name on Linux and macOS.
 
     Args:
         field: named in the error.
@@ -43,18 +42,17 @@ def file_name(field: str, name: object, hint: str) -> str:
 
     Raises:
         InputError: text that is empty, too long or not printable, that contains a separator or a reserved character,
-            that begins or ends with a dot or a space, or that names a device of Windows.
+            that begins or ends with a dot or a space.
 
     >>> file_name("id", "car 12", "Rename the vehicle.")
     'car 12'
     """
-    if isinstance(name, str) and name.isprintable() and re.fullmatch(r'[^<>:"/\\|?*]+', name):
-        device = name.partition(".")[0].strip().upper() in _DEVICES
-        if not device and name == name.strip(" .") and len(name.encode()) <= _LONGEST:
-            return name
+    plain = isinstance(name, str) and name.isprintable() and re.fullmatch(r'[^<>:"/\\|?*]+', name)
+    if isinstance(name, str) and plain and name == name.strip(" .") and len(name.encode()) <= _LONGEST:
+        return name
     allowed = (
         f'must be a file name: at most {_LONGEST} bytes, printable, without < > : " / \\ | ? *, '
-        "no dot or space at its ends, and no device of Windows such as CON"
+        "no dot or space at its ends"
     )
     raise InputError(field, shown(name), allowed, hint)
 
