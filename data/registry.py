@@ -244,6 +244,9 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
             raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
     if not (path.is_file() or path.is_dir()):
         raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
+    for each in (path, *path.rglob("*")):
+        if str(each).encode(errors="replace").decode() != str(each):
+            raise InputError("data", ascii(str(each)), "must have a name in UTF-8", "Rename it.")
     return read(path, **options)
 
 

@@ -439,6 +439,10 @@ def test_training_refuses_values_from_elsewhere():
 
 @pytest.mark.parametrize("path", [np.array(3), pd.NA, None, "", "a" * 300, "a/" * 3000, "a\0b", "\ud800", Foreign()])
 def test_paths_that_no_file_system_holds_are_refused(tmp_path, path):
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log/\udcf6.csv").write_text("t,vehicle,x,y\n0,a,0,0\n1,a,1,0\n")
+    with refused("must have a name in UTF-8"):
+        co.read_log(tmp_path / "log")
     learned = pytest.importorskip("coopoc.learned")
     checkpoint = learned.Checkpoint(learned.NoiseParameters(), {})
     reads = (co.read_graph, co.load_fleet, co.read_log, co.Results.load, learned.load, views)
