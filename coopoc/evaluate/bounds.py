@@ -146,11 +146,13 @@ def bound_rt_le(cov: Floats) -> float:
     """RT-LE that belongs to a bound (T, 3, 3), sqrt(mean_t trace P_t), m.
 
     Raises:
-        InputError: another shape, or numbers that are not finite.
+        InputError: another shape, numbers that are not finite, or a negative trace.
     """
     cov = checked("cov", cov, "(T, 3, 3)", (-1, 3, 3))
     refuse("cov", cov, ~np.isfinite(cov), "must be finite", "Take the steps at which the ego is there.")
-    return float(np.sqrt(np.trace(cov, axis1=-2, axis2=-1).mean()))
+    square = np.trace(cov, axis1=-2, axis2=-1)
+    refuse("trace of cov", square, square < 0.0, "must be >= 0: variances, m^2", "Give a covariance, no information.")
+    return float(np.sqrt(square.mean()))
 
 
 def checked_noise(fleet: Fleet, sensors: Sensors, v2x: V2X | None, landmarks: bool = False) -> V2X:
