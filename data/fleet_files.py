@@ -60,8 +60,8 @@ def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
         write(path, named.to_csv(index=False, lineterminator="\n"))
     else:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
-        options = {"compression": "zstd", "use_dictionary": ["id", "t"], "column_encoding": split}
-        write(path, lambda file: frame.to_parquet(file, index=False, **options))
+        options: dict[str, Any] = {"use_dictionary": ["id", "t"], "column_encoding": split}
+        write(path, lambda file: frame.to_parquet(file, index=False, compression="zstd", **options))
 
 
 def tum_files(path: Path) -> list[Path]:

@@ -148,7 +148,7 @@ def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
 
 def _filter(name: str, k: int, drive: Drive) -> PoseFilter:
     options = drives.POSES[name if k else "pose-solo"]
-    return PoseFilter(**options, lasting=drive.lasting, gate=drives.GATE, begin=drive.begin, spread=drive.spread)
+    return PoseFilter(**options, lasting=drive.lasting, gate=drives.GATE_STDS, begin=drive.begin, spread=drive.spread)
 
 
 def _scores(track: Track, recording: Recording, truth: Fleet | None) -> dict[str, Floats]:
