@@ -262,6 +262,8 @@ def climbing(fixes: Signal) -> float:
     >>> t = np.arange(60.0)
     >>> climbing(Signal(t, 0.5 * t[:, None] * [1, 1, 1])) > 0.1, climbing(Signal(t, np.zeros((60, 3))))
     (True, 0.0)
+    >>> [round(climbing(Signal(t[:count], 0.5 * t[:count, None] * [1, 1, 1])), 2) for count in (4, 5)]
+    [0.0, 0.17]
     """
     t, z, wander = fixes.t, fixes.value[:, 2], 0.0
     least = max(1.0, 0.5 * float(np.median(np.diff(t)))) if len(t) > 1 else 1.0
