@@ -189,7 +189,7 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
     def cost(x: Floats) -> float:
         return problem.cost(x) if constraint_rows(problem, x).outside.max() <= FEASIBLE else np.inf
 
-    x, ends = drawn(islice(scattered(problem, first.x), QUIET_DRAWS), first.x, descend, cost, QUIET_DRAWS)
+    x, ends = drawn(islice(scattered(problem, first.x), QUIET_DRAWS), first.x, descend, cost)
     notes, start = doubts(x, ends, cost), search.start
     if x is not first.x:
         steps, start, first = steps + first.iterations, "drawn", backend.run(problem, x, options)

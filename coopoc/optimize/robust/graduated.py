@@ -160,7 +160,7 @@ def contest(
         loose = movable(cauchy)
         mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
         places = islice(_places(cauchy, mirrored_x, loose), QUIET_DRAWS)
-        best_x, tried = drawn(places, mirrored_x, lambda at: landed(soft(at)), cost, QUIET_DRAWS, AGREEING_DRAWS)
+        best_x, tried = drawn(places, mirrored_x, lambda at: landed(soft(at)), cost, AGREEING_DRAWS)
         d, (lowest, _) = cauchy.dimension, min(tried, key=lambda end: end[0])
         size = RIVAL_DISTANCE * np.ptp(np.concatenate([y[:, :d] for _, y in tried]), axis=0).max()
         notes = doubts(best_x, [end for end in tried if np.abs(end[1] - best_x)[:, :d].max() > size], cost)

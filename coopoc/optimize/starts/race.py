@@ -29,11 +29,9 @@ EXCESS_STDS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
 RIVAL_COST = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
-DRAWS, QUIET_DRAWS, DRAWN_POINTS, HIGH_STDS = 90, 30, 1800, 2.0
-"""Random starts at most, if the first lead to no other minimum of about the cost and this is no more than so many
-standard deviations above its mean, and as many points together."""
-AGREEING_DRAWS = 10
-"""Of them that must lead to the lowest minimum to end them: with all 90 of 105 problems no answer was lower."""
+DRAWS, QUIET_DRAWS, AGREEING_DRAWS, DRAWN_POINTS = 90, 30, 20, 1800
+"""Random starts at most, with constraints or losses, that lead to the lowest minimum and end them, and points together.
+"""
 SAME_MINIMUM, ROUNDED_COST = 1e-5, 1e-9
 """Share by which the costs of two random starts that led to the same minimum differ, and cost that is rounding."""
 BARRIER = 0.1
@@ -106,8 +104,7 @@ def race(
         ends = list[tuple[float, Floats]]()
         if draws:
             x = descend(x, LATER_STEPS)
-            quiet = QUIET_DRAWS if system.cost(x) <= mean + HIGH_STDS * np.sqrt(variance) else DRAWS
-            y, ends = drawn(scattered(problem, x), x, landed, system.cost, quiet)
+            y, ends = drawn(scattered(problem, x), x, landed, system.cost)
             name, x = (name if y is x else "drawn"), y
         far = name not in straight and system.cost(x) > limit
         x, moves, others = across(problem, x, descend, system.cost, far)
@@ -210,23 +207,18 @@ def smooth(record: Floats) -> bool:
 
 
 def drawn(
-    places: Iterable[Floats], x: Floats, descend: Descend, cost: Cost, quiet: int, agreeing: int = AGREEING_DRAWS
+    places: Iterable[Floats], x: Floats, descend: Descend, cost: Cost, agreeing: int = AGREEING_DRAWS
 ) -> tuple[Floats, list[tuple[float, Floats]]]:
-    """The lowest end (n, ambient) of x and of descents from other places, and all ends with their costs, x first.
-
-    So many places are tried as are `quiet`, or all where one leads to another minimum of about the cost; fewer where
-    `agreeing` lead to the lowest.
-    """
-    best, least, most = x, float(np.nan_to_num(cost(x), nan=np.inf)), quiet
+    """The lowest end (n, ambient) of x and of descents from other places, until `agreeing` lead to the lowest; and all
+    ends with their costs, x first."""
+    best, least = x, float(np.nan_to_num(cost(x), nan=np.inf))
     ends = [(least, x)]
     for y in places:
-        if len(ends) > most or sum(not higher(each, least) for each, _ in ends) >= agreeing:
+        if sum(not higher(each, least) for each, _ in ends) >= agreeing:
             break
         y = descend(y)
         now = float(np.nan_to_num(cost(y), nan=np.inf))
         ends.append((now, y))
-        if now < least + RIVAL_COST and (higher(now, least) or higher(least, now)):
-            most = DRAWS
         best, least = (y, now) if higher(least, now) else (best, least)
     return best, ends
 
