@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc.arrays import Floats
-from coopoc.evaluate.metrics import dimensions
 from coopoc.methods.doubts import when
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.odometry_fault import with_odometry
@@ -46,7 +44,7 @@ from .relative import (
     of_measurements,
     of_ranges,
 )
-from .residuals import Check, filtered
+from .residuals import Check, filtered, without_wild
 
 MISTAKEN = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
@@ -65,6 +63,8 @@ CONFIDENT_RATIO = 3.0
 """Ratio of a filter's errors to their stated standard deviations, in a part of the drive, from which it is reported."""
 UNUSED_SHARE = 0.05
 """Share of the logged rows that may be left out without a sentence."""
+AXIS_TURN = 20.0
+"""Degrees by which odometry is turned from which its forward axis is another."""
 PERHAPS = 2.0
 """Standard errors from which an error may be real, and is named as not known."""
 DIVERGED = 0.3
@@ -97,13 +97,18 @@ def check(log: Log) -> Check:
             that are not known.
     """
     first = filtered(log)
-    first = replace(first, failing=_failing(first) if log.recording.body is None else {})
+    first = without_wild(replace(first, failing=_failing(first) if log.recording.body is None else {}))
     rows = _vehicles(first)
     wrong = ([row["vehicle"] for row in rows if off(row) or row["vehicle"] in first.failing] for off in (_off, _drifts))
     errs, drifts = ([*map(first.world.ids.index, names)] for names in wrong)
     result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
     result = replace(result, vehicles=_vehicles(result))
-    if log.truth is not None and not any(_late(first, row) for row in result.vehicles) and not result.slack.any():
+    if (
+        log.truth is not None
+        and not any(_late(first, row) for row in result.vehicles)
+        and not result.ahead.any()
+        and not any(of_ranges(result))
+    ):
         result = against_truth(result)
     elif log.recording.body is None:  # what errs says nothing of others
         result = _without(result, errs)
@@ -238,86 +243,84 @@ def _of_errors(c: Check) -> list[str]:
 
 def _of_vehicles(c: Check) -> list[str]:
     """Noise, outliers, distances and directions of the fixes against the odometry."""
-    sentences, size = [], dimensions(c.world)
-    for row in c.vehicles:
-        name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
-        column = c.world.ids.index(name)
-        there = np.isfinite(c.normalised[:, column])
-        square = size * c.normalised[there, column]
-        outliers = 0.0
-        if len(square) > LEAST_COUNT:
-            usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04)
-            outliers = np.mean(square > OUTLYING**2 * usual)
-        if name in c.failing:
-            nis, outliers = None, 0.0
-        if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / max(len(square), 1)):
-            sentences.append(
-                f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
-                "outliers, which a filter without a gate follows."
-            )
-        if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= 2:
-            sentences.append(
-                f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
-                "as stated, or correlated in time. Give std columns or sensors=."
-            )
-        axes = _axes(c, column)
-        sentences += [f"{name}: {axes}"] * bool(axes)
-        if axes or name in c.log.summary.assumed.get(CLOCKWISE, ()):
-            continue
-        if _beyond(row, "fixes_late_s", BEHIND):
-            sentences.append(
-                f"{name}: its fixes are {abs(row['fixes_late_s']):.2f} +- {row['fixes_late_s_error']:.2f} s "
-                f"{'behind' if row['fixes_late_s'] > 0 else 'ahead of'} its odometry: clocks differ, or the receiver "
-                "smooths them. It cannot be said yet whether the odometry errs."
-            )
-        east, north = row.get("beside_east", 0.0), row.get("beside_north", 0.0)
-        unsure = np.hypot(row.get("beside_east_error", 0.0), row.get("beside_north_error", 0.0))
-        if np.hypot(east, north) > max(BESIDE, SURE_ERRORS * unsure):
-            sentences.append(
-                f"{name}: it moves by {np.hypot(east, north):.2f} +- {unsure:.2f} m/s towards "
-                f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
-                "current, a ferry; or fixes that drift."
-            )
-        if distance is not None and not 0.8 <= distance <= 1.25:
-            unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
-            sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
-        elif name in c.failing:
-            moved, driven, *_ = moves(c, column)
-            back = np.abs(moved + driven) < 0.5 * np.abs(moved)
-            cause = "slips, or a speed or heading that is held or wrong."
-            if back.sum() >= 3:
-                cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
-            sentences.append(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
-        elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
-            sentences.append(
-                f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "
-                "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
-            )
-            continue
-        elif _beyond(row, "speed_excess", LEAST_SCALE):
-            word = "fast" if row["speed_excess"] > 0 else "slow"
-            sentences.append(
-                f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
-                f"{100 * row['speed_excess_error']:.2f} %: multiply its speeds by "
-                f"{1 / (1 + row['speed_excess']):.4g}, or take a pose filter, which estimates it."
-            )
-        if _beyond(row, "yaw_rate_bias", LEAST_DRIFT):
-            sentences.append(
-                f"{name}: its yaw rates are too large by {row['yaw_rate_bias']:.2g} +- "
-                f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
-            )
-        if turn is not None and abs(turn) <= 20 and _beyond(row, "turned", LEAST_TURN):
-            sentences.append(
-                f"{name}: its odometry is turned by {np.rad2deg(row['turned']):.2f} +- "
-                f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, the mounting of a sensor, "
-                "or, on a bend at one speed, a clock."
-            )
-        if turn is not None and abs(turn) > 20:
-            sentences.append(
-                f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
-                f"look turned by {-turn:.0f} deg. Speeds are positive forward, headings anticlockwise from +x (east), "
-                "rad; clockwise from north in degrees is compass_deg."
-            )
+    return [sentence for row in c.vehicles for sentence in _of_vehicle(c, row)]
+
+
+def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
+    """Of one; odometry that fails, or noise that is not as stated, where nothing else explains it."""
+    name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
+    column, sentences = c.world.ids.index(name), list[str]()
+    share = c.wild[column] / max(row["fixes"] + c.wild[column], 1)
+    if share > OUTLIER_SHARE and c.wild[column] > LEAST_OUTLIERS:
+        sentences.append(
+            f"{name}: {share:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: outliers, "
+            "which a filter without a gate follows."
+        )
+    axes = _axes(c, column)
+    sentences += [f"{name}: {axes}"] * bool(axes)
+    if axes or name in c.log.summary.assumed.get(CLOCKWISE, ()):
+        return sentences
+    if _beyond(row, "fixes_late_s", BEHIND):
+        sentences.append(
+            f"{name}: its fixes are {abs(row['fixes_late_s']):.2f} +- {row['fixes_late_s_error']:.2f} s "
+            f"{'behind' if row['fixes_late_s'] > 0 else 'ahead of'} its odometry: clocks differ, or the receiver "
+            "smooths them. It cannot be said yet whether the odometry errs."
+        )
+    east, north = row.get("beside_east", 0.0), row.get("beside_north", 0.0)
+    unsure = np.hypot(row.get("beside_east_error", 0.0), row.get("beside_north_error", 0.0))
+    if np.hypot(east, north) > max(BESIDE, SURE_ERRORS * unsure):
+        sentences.append(
+            f"{name}: it moves by {np.hypot(east, north):.2f} +- {unsure:.2f} m/s towards "
+            f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
+            f"current, a ferry; or fixes that drift. offset=vx:{-east:.2g},vy:{-north:.2g} takes it off velocities if "
+            "it is alike for all; else the std of a speed or velocity that lets filters follow the fixes is "
+            f"{np.hypot(east, north) * (len(c.world.t) / row['fixes']) ** 0.5:.2g} m/s."
+        )
+    if turn is not None and abs(turn) > AXIS_TURN:
+        sentences.append(
+            f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
+            f"look turned by {-turn:.0f} deg. Speeds are positive forward, headings anticlockwise from +x (east), "
+            "rad; clockwise from north in degrees is compass_deg."
+        )
+    elif turn is not None and _beyond(row, "turned", LEAST_TURN):
+        sentences.append(
+            f"{name}: its odometry is turned by {np.rad2deg(row['turned']):.2f} +- "
+            f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, the mounting of a sensor, "
+            "or, on a bend at one speed, a clock."
+        )
+    if distance is not None and not 0.8 <= distance <= 1.25:
+        unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
+        sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
+    elif name in c.failing and not sentences:
+        moved, driven, *_ = moves(c, column)
+        back = np.abs(moved + driven) < 0.5 * np.abs(moved)
+        cause = "slips, or a speed or heading that is held or wrong."
+        if back.sum() >= 3:
+            cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
+        sentences.append(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
+    elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
+        sentences.append(
+            f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "
+            "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
+        )
+        return sentences
+    elif _beyond(row, "speed_excess", LEAST_SCALE):
+        word = "fast" if row["speed_excess"] > 0 else "slow"
+        sentences.append(
+            f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
+            f"{100 * row['speed_excess_error']:.2f} %: multiply its speeds by "
+            f"{1 / (1 + row['speed_excess']):.4g}, or take a pose filter, which estimates it."
+        )
+    if _beyond(row, "yaw_rate_bias", LEAST_DRIFT):
+        sentences.append(
+            f"{name}: its yaw rates are too large by {row['yaw_rate_bias']:.2g} +- "
+            f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
+        )
+    if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= (np.inf if sentences else 2.0):
+        sentences.append(
+            f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
+            "as stated, or correlated in time. Give std columns or sensors=."
+        )
     return sentences
 
 
@@ -388,7 +391,7 @@ def _of_fixes(c: Check) -> list[str]:
         for share in ([1, 1, 1], [0, 0, 1])[shown:]:  # without an arm that is sure a clock may explain it all
             x, z = (each[:, finite, column].T * share for each in (made, then))
             factor, std = factors(off[finite, column], x, usual, every_one, z=z)
-            sure = np.abs(factor) > OFFSET_ERRORS * std * max(row.get("nis") or 1.0, 1.0) ** 0.5
+            sure = np.abs(factor) > OFFSET_ERRORS * std
             if (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM:
                 sentences.append(
                     f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
@@ -406,16 +409,14 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND):
             continue
-        derived = shown or (truth is None and _off(row))  # what draws aside draws along a bend, too
-        if sure[2] and abs(lag := factor[2]) >= LEAST_LAG and not derived:
+        if truth is None:  # what draws aside draws along a bend, too
+            continue
+        if sure[2] and abs(lag := factor[2]) >= LEAST_LAG:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(
-                f"{name}: its fixes are {abs(lag):.2f} s {way} the {'odometry' if truth is None else 'truth'} along "
-                "its way: clocks differ, or fixes carry the time at which they arrived; at one speed an antenna ahead "
-                "looks alike."
+                f"{name}: its fixes are {abs(lag):.2f} s {way} the truth along its way: clocks differ, or fixes carry "
+                "the time at which they arrived; at one speed an antenna ahead looks alike."
             )
-            continue
-        if truth is None:
             continue
         every = rec.gnss[0, :, column] - truth.position[:, column]
         both = np.isfinite(every[:, 0])

@@ -11,14 +11,14 @@ from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
 
-from .motion import MOVING
+from .motion import COURSE, MOVING
 from .residuals import Check, filtered, plane, residual_of
 
 SURE_ERRORS = 4.0
 """Standard errors beyond which an estimate is significant: of the hundreds in a few logs one exceeds three."""
 LEAST_LAG, LEAST_SCALE, LEAST_TURN, LEAST_DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
-BESIDE, BEHIND = 0.1, 0.5
+BESIDE, BEHIND = 0.1, 0.1
 """m/s, least velocity across that of the odometry, and s, least lag of fixes behind it, that are reported."""
 UNITS_APART = 0.2
 """Relative error of lengths from which their unit is wrong."""
@@ -30,9 +30,9 @@ LEAST_CORRELATION = 0.97
 """Correlation of the displacements of fixes and odometry that noise alone does not reach."""
 MIN_OWN_SHARE = 0.02
 """Least share of a cause's sum of squares that the other causes do not explain, so that it can be told from them."""
-OUTLYING, DRIVE_PARTS = 5.0, 10
-"""Multiples of the median residual beyond which one is left out; parts of a drive, whose estimates give the standard
-error."""
+OUTLYING, TENTHS, DRIVE_PARTS = 5.0, 10, 40
+"""Multiples of the median residual beyond which one is left out; parts of a drive in which a filter is judged, and those
+whose estimates give the standard error."""
 LONG_LAG = 2.0
 """s, from which a lag is searched for: shorter ones are estimated linearly."""
 LONGEST_LAG, LAG_STEP = 60.0, 0.1
@@ -56,9 +56,9 @@ def factors(
     groups: Ints | None = None,
     z: AnyArray | None = None,
 ) -> Estimate:
-    """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, with standard errors by parts
-    that are left out; less the means of groups (M,). None is known where half of y stays, and that is OUTLYING times
-    its noise: something else is wrong.
+    """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, less the means of groups (M,);
+    and standard errors, as leaving out each part of the drive changes them. None is known where half of y stays, and
+    that is OUTLYING times its noise: something else is wrong.
 
     The instruments z (M, k), x itself if not given, are causes without the noise that is in both x and y.
 
@@ -66,30 +66,48 @@ def factors(
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
-    k, all_of = x.shape[1], np.column_stack([y, x] if z is None else [y, x, z])
+    k, all_of = x.shape[1], np.column_stack([y, x, x if z is None else z])
     none = Estimate(np.zeros(k), np.full(k, np.inf))
     if len(y) < LEAST_COUNT:
         return none
     if groups is not None:
         all_of = _centred(all_of, groups)
-    y, x = all_of[:, 0], all_of[:, 1 : k + 1]
+    y, x, both = all_of[:, 0], all_of[:, 1 : k + 1], all_of[:, None, : k + 1]
+    products = (all_of[:, k + 1 :, None].conj() * both).real
 
-    def fitted(rows: Ints) -> Floats:
+    def fitted(used: Bools) -> Floats:
+        factor = np.zeros(k)
         for _ in range(3):
-            both = np.concatenate([all_of[rows].real, all_of[rows].imag])
-            both = both if z is None else both[:, k + 1 :].T @ both[:, : k + 1]
-            factor: Floats = np.linalg.lstsq(both[:, 1 : k + 1], both[:, 0])[0]
+            sums = products[used].sum(axis=0)
+            factor = np.linalg.lstsq(sums[:, 1:], sums[:, 0])[0]
             gap = np.abs(y - x @ factor)
-            rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
+            used = used & (gap <= OUTLYING * np.median(gap[used]))
         return factor
 
     every = np.arange(len(y))
-    value, *without = map(fitted, [every, *(np.setdiff1d(every, part) for part in np.array_split(every, DRIVE_PARTS))])
+    value = fitted(every >= 0)
     before, left = (np.median(np.abs(gap)) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    error = np.sqrt(DRIVE_PARTS - 1.0) * np.std(without, axis=0)
-    return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
+    count = min(DRIVE_PARTS, len(y) // 2)
+    changes = value - np.stack([fitted(every * count // len(y) != part) for part in range(count)])
+    return Estimate(value, np.where(np.any(x, axis=0), lasting(changes), np.inf))
+
+
+def lasting(parts: Floats) -> Floats:
+    """Standard error (k,) of a sum of errors in parts (P, k) of a drive, each of which is correlated with the next, as
+    of an autoregression of first order; the correlation of few is too small by chance (Kendall, Biometrika 41, 1954).
+
+    >>> wander = np.cumsum(np.random.default_rng(0).normal(size=(40, 1)), axis=0)
+    >>> bool(lasting(wander)[0] > 2.0 * 40**0.5 * wander.std())
+    True
+    """
+    errors, count = parts - parts.mean(axis=0), len(parts)
+    square = np.square(errors).sum(axis=0)
+    next_to = (errors[1:] * errors[:-1]).sum(axis=0) / np.maximum(square, 1e-300)
+    correlation = ((count * next_to + 1.0) / (count - 4.0)).clip(0.0, 0.95)
+    error: Floats = np.sqrt(square * (1.0 + correlation) / (1.0 - correlation))
+    return error
 
 
 def _centred(values: AnyArray, groups: Ints) -> AnyArray:
@@ -190,14 +208,18 @@ def odometry(c: Check, column: int) -> Estimate:
             moved, driven, turns, bends, span = moves(c, column, max(means, 2))
         square = max(np.square(np.abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
-        value, error = _of_motion(moved - driven, causes, span, 2**0.5 * c.fix_noise)
+        y = moved - driven
+        if rec.ids[column] in c.log.summary.assumed.get(COURSE.format("{}", "fixes"), ()):
+            along = driven.conj() / np.abs(driven)  # across, a heading that is derived follows the fixes
+            y, causes, span = (y * along).real + 0j, (causes * along).real + 0j, 0.0 * span
+        value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
         attenuation = (np.linalg.norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
         turned = (1 + complex(*value[:2])) * (1 + attenuation)
         if not turned:
             return none
         value[:2], value[2] = _polar(1 / turned), -value[2]
         error[:2] = np.hypot(error[:2], attenuation) / abs(turned) ** 2
-        if abs(value[2]) > max(BEHIND, SURE_ERRORS * error[2]):  # smoothed fixes cut bends: all else seems wrong
+        if abs(value[2]) > max(5.0 * BEHIND, SURE_ERRORS * error[2]):  # smoothed fixes cut bends: all else seems wrong
             error[[0, 1, 3, 4]] = np.inf
         return Estimate(value, error)
     path = plane(truth.position[:, column])
@@ -232,7 +254,7 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
         unit = np.concatenate([causes.real, causes.imag], axis=1)
         unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
         alone = 1.0 / np.diag(np.linalg.inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
-        if extra and (alone < MIN_OWN_SHARE).any():
+        if extra and ((alone < MIN_OWN_SHARE) & unit.any(axis=1)).any():
             continue
         found = factors(y, causes.T, noise)
         if np.linalg.norm(found.value[extra]) >= 2.0 * np.linalg.norm(found.error[extra]):
@@ -317,8 +339,8 @@ def median(values: Floats) -> tuple[float, float]:
     """Median, and its standard error by the medians of parts of the drive; infinite of too few."""
     if len(values) < LEAST_COUNT:
         return 0.0, np.inf
-    parts = [np.median(part) for part in np.array_split(values, DRIVE_PARTS)]
-    return float(np.median(values)), float(np.std(parts) / np.sqrt(DRIVE_PARTS - 1.0))
+    parts = np.array([np.median(part) for part in np.array_split(values, min(DRIVE_PARTS, len(values) // 2))])
+    return float(np.median(values)), float(lasting(parts[:, None])[0] / len(parts))
 
 
 def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
@@ -330,16 +352,10 @@ def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
     return pd.Series(one + (" to " if directed else " and ") + other, there)
 
 
-def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
-    """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
-    errors of the filters and of the clocks that were taken off, which last."""
-    made, lasts, names = {}, share(c), pairs(c, k, k > 0)
-    for pair, rows in names.groupby(names).groups.items():
-        (offset, error), slack = median(c.relative[rows, k]), c.slack[rows, min(k, 1)].mean(axis=0)
-        position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
-        lasting = stated**2 / len(rows) + position * lasts + np.square(slack).sum()
-        made[str(pair)] = offset, float(np.sqrt(error**2 + lasting))
-    return made
+def offsets(c: Check, k: int) -> dict[str, tuple[float, float]]:
+    """Pairs -> the median of their residuals of one kind, and its standard error."""
+    names = pairs(c, k, k > 0)
+    return {str(pair): median(c.relative[rows, k]) for pair, rows in names.groupby(names).groups.items()}
 
 
 def lag_of_fixes(c: Check, column: int) -> float:
@@ -383,7 +399,10 @@ def against_truth(c: Check) -> Check:
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
-    residual, stated = residual_of(rec, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
+    residual, stated = (
+        residual_of(rec, x, c.log.summary.told)[1],
+        [noise.range_std, noise.world_azimuth_std, noise.inclination_std],
+    )
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
     relative = np.where(used, residual, c.relative)
     fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)  # of others nothing is known
@@ -394,13 +413,7 @@ def against_truth(c: Check) -> Check:
 def on_time(c: Check, alike: bool) -> Check:
     """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share, and
     less what wrong ones explain."""
-    reference = None
-    if c.log.truth is not None:
-        off, (_, _, velocity), _ = causes(c)
-        seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
-        covered = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
-        reference = int(np.argmin(np.where(covered, np.abs(seconds), np.inf))) if covered.any() else None
-    (value, error), made = clocks(c, reference, alike)
+    (value, error), made = clocks(c, None, alike)
     size, maybe = len(c.world.ids), np.abs(value) > 2.0 * error
     if alike and not (maybe[size:].any() and abs(value[size]) < UNITS_APART):  # clocks look like it, or undo it
         return on_time(c, False)
@@ -408,9 +421,8 @@ def on_time(c: Check, alike: bool) -> Check:
     off = np.where(np.abs(value) > np.maximum(SURE_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ off)
-    slack = np.nan_to_num(made * np.where(off, error, 0.0))
     ranges = tuple(zip(off[size:], error[size:], strict=True))
-    return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], slack=slack, ranges=ranges)
+    return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], ranges=ranges)
 
 
 def worst(c: Check, column: int) -> tuple[float | None, float]:
@@ -421,7 +433,7 @@ def worst(c: Check, column: int) -> tuple[float | None, float]:
     square, stated = np.square(c.x - c.log.truth.position)[:, column, :size], c.variance[:, column, :size]
     stated = np.where(np.isfinite(square), stated, np.nan)
     ratios = dict[float, float]()
-    for part in np.array_split(np.arange(len(t)), DRIVE_PARTS):
+    for part in np.array_split(np.arange(len(t)), TENTHS):
         all_of = np.nansum(stated[part])
         if all_of > 0:
             ratios[float(t[part[0]] - t[0])] = float(np.sqrt(np.nansum(square[part]) / all_of))

@@ -49,6 +49,9 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
         if reached.any():
             summary.assume(RADAR, str(int(reached.sum())))
         back = far[~reached]
+        heard = back["neighbour"] * len(members) + back["observer"]
+        own = measured["observer"] * len(members) + measured["neighbour"]
+        summary.told = np.setdiff1d(heard, own).tolist()
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
         both = both.drop_duplicates([*PAIR, "component"])
         if len(both) > len(measured):

@@ -20,7 +20,7 @@ MAX_ANGLE_STD, MIN_STD_SHARE = 0.5, 1e-3
 """rad, largest standard deviation of angles that is offered; least share of a stated one that is offered instead: of
 numbers without noise it would be 0."""
 HINTS = {
-    "range": "Are clocks, or the positions of one, off?",
+    "range": "Do fixes drift, or are clocks, or the positions of one, off?",
     "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "
     "whose heading they count from, and that no axis is mirrored.",
     "inclination": "Inclinations count from +z, elevations from the horizon.",
@@ -28,6 +28,8 @@ HINTS = {
 """What to look for where measurements of a kind miss the positions."""
 OUTLIER_SHARE, LEAST_OUTLIERS = 0.01, 3
 """Share of measurements beyond 5 standard deviations that is reported, if these are more than several."""
+LASTS_STDS = 0.6
+"""Standard deviations of two fixes by which receivers may be off for long, over OUTLYING."""
 MEDIAN_WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
 WRONG_SHARE, NAMED_CASES = 0.8, 4
@@ -116,7 +118,7 @@ def of_measurements(c: Check) -> list[str]:
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
             )
-        if wrong:
+        if wrong and not (misfits and hint == HINTS[name]):
             sentences.append(f"{word}s miss the positions by {stated}. {hint}")
         if misfits and (not wrong or hint == HINTS[name]):
             count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
@@ -158,8 +160,9 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
-        errors = pd.Series(np.abs(wrap(less) if k else less) / expected).rolling(MEDIAN_WINDOW, 1, center=True)
-        bad = np.flatnonzero(errors.median() > OUTLYING)  # most of MEDIAN_WINDOW are too large
+        lasts = LASTS_STDS * c.fix_noise / (np.maximum(measured[rows], 1.0) if k else 1.0)
+        errors = pd.Series(np.abs(wrap(less) if k else less) / np.maximum(expected, lasts))
+        bad = np.flatnonzero(errors.rolling(MEDIAN_WINDOW, 1, center=True).median() > OUTLYING)  # most are too large
         if len(bad) < LEAST_COUNT:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
@@ -177,7 +180,7 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
     and standard errors, largest first."""
     named = [
         (pair, offset, error)
-        for pair, (offset, error) in offsets(c, k, stated).items()
+        for pair, (offset, error) in offsets(c, k).items()
         if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated)
     ]
     return sorted(named, key=lambda row: -abs(row[1]))

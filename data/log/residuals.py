@@ -5,10 +5,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
-from coopoc.arrays import AnyArray, Bools, Floats
-from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
+from coopoc.arrays import AnyArray, Bools, Floats, Ints
+from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
 from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.world.body_frames import in_world
 from coopoc.world.links import spherical, stretches, wrap
@@ -19,6 +21,8 @@ TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 """m and rad, of first poses that the truth gives."""
 GATE_STDS = 5.0
 """Standard deviations of an innovation beyond which the pose filters that check a log leave a measurement out."""
+WILD_STDS, LEAST_NIS = 5.0, 0.04
+"""Multiples of the usual innovation of a vehicle's fixes beyond which one is left out; least that its square is taken for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +43,9 @@ class Check:
         lasting: (2, N, 2) scale error of speeds and bias of yaw rates rad/s as the filters end, and their deviations.
         ahead: (N,) s, of clocks, 0 where none is sure.
         unsure: (N,) s, standard errors of these.
-        slack: (L, 2, N + 2) m and rad, of ranges and directions, that a standard error of what is taken off makes: of
-            each clock, and of what follows.
         ranges: share by which they are too long, s by which they are late, 0 where not sure; each with its standard
             error.
+        wild: (N,) fixes that were left out: beyond WILD_STDS times the vehicle's usual innovation.
         failing: vehicles whose odometry fixes correct -> when, in words.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
@@ -63,7 +66,7 @@ class Check:
     lasting: Floats
     ahead: Floats
     unsure: Floats
-    slack: Floats
+    wild: Ints
     ranges: tuple[tuple[float, float], ...] = ()
     failing: Mapping[str, str] = field(default_factory=dict)
     vehicles: Sequence[Mapping[str, Any]] = ()
@@ -133,6 +136,18 @@ def _moving(rec: Recording) -> list[int]:
     return [k for k in range(len(rec.ids)) if k not in rec.landmarks]
 
 
+def without_wild(c: Check) -> Check:
+    """The same, less the fixes that are wild, of vehicles whose odometry does not fail."""
+    size, rec = dimensions(c.world), c.log.recording
+    square = pd.DataFrame(size * c.normalised).drop(columns=[*map(rec.ids.index, c.failing)])
+    wild = square > WILD_STDS**2 * (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS)
+    wild = wild.reindex(columns=range(len(rec.ids)), fill_value=False).to_numpy()
+    if rec.body is not None or not wild.any():
+        return c
+    less = replace(rec, gnss=np.where(wild[..., None], np.nan, rec.gnss))
+    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(axis=0), failing=c.failing)
+
+
 def filtered(log: Log) -> Check:
     """The log with a Kalman filter of each vehicle alone, in body frames a pose filter; and the residuals of relative
     measurements against these filters, with the deviations that they should have."""
@@ -166,7 +181,7 @@ def filtered(log: Log) -> Check:
     world, noise = rec, rec.sensors
     if rec.body is not None:
         world = in_world(replace(rec, body=replace(rec.body, heading=heading[None])))
-    gap, residual = residual_of(world, x)
+    gap, residual = residual_of(world, x, log.summary.told)
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
     flat, distance = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
     expected = np.column_stack([both, both / flat**2, both / distance**2])
@@ -175,7 +190,7 @@ def filtered(log: Log) -> Check:
     log = replace(log, recording=rec)
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
-    return Check(log, span + start, world, track, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)))
+    return Check(log, span + start, world, track, *stats, none, infinite, np.zeros(vehicles, dtype=np.int64))
 
 
 def plane(vectors: Floats) -> AnyArray:
@@ -183,10 +198,12 @@ def plane(vectors: Floats) -> AnyArray:
     return vectors[..., :2] @ [1, 1j]
 
 
-def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:
-    """(L, 3) m, from observers to neighbours at positions x (T, N, 3), and measured less computed from these."""
+def residual_of(world: Recording, x: Floats, told: Sequence[int] = ()) -> tuple[Floats, Floats]:
+    """(L, 3) m, from observers to neighbours at positions x (T, N, 3), and measured less computed from these, NaN of
+    pairs that are `told` (`Summary`): they are of another's clock."""
     links = world.links
     gap = x[links.step, links.neighbour] - x[links.step, links.observer]
     residual = world.relative[0] - np.column_stack(spherical(*gap.T))
     residual[:, 1:] = wrap(residual[:, 1:])
+    residual[np.isin(links.observer * len(world.ids) + links.neighbour, told)] = np.nan
     return gap, residual

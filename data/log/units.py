@@ -227,6 +227,7 @@ class Summary:
         odometry: s, from one sample of it to the next, 0 where there is none.
         rows: how many numbers were logged.
         shown: vehicles of which fixes alone have shown the velocity, or its direction without a gyro.
+        told: observer times members, plus neighbour, of pairs that have only what the other end measured.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
 
     >>> summary = Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3})
@@ -250,6 +251,7 @@ class Summary:
     odometry: float = 0.0
     rows: int = 0
     shown: list[str] = field(default_factory=list)
+    told: list[int] = field(default_factory=list)
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
     def count(self, what: str, number: int) -> None:
