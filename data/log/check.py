@@ -268,13 +268,13 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         )
     east, north = row.get("beside_east", 0.0), row.get("beside_north", 0.0)
     unsure = np.hypot(row.get("beside_east_error", 0.0), row.get("beside_north_error", 0.0))
-    if np.hypot(east, north) > max(BESIDE, SURE_ERRORS * unsure):
+    if (pace := float(np.hypot(east, north))) > max(BESIDE, SURE_ERRORS * unsure):
         sentences.append(
-            f"{name}: it moves by {np.hypot(east, north):.2f} +- {unsure:.2f} m/s towards "
+            f"{name}: it moves by {pace:.2f} +- {unsure:.2f} m/s towards "
             f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
             f"current, a ferry; or fixes that drift. offset=vx:{-east:.2g},vy:{-north:.2g} takes it off velocities if "
             "it is alike for all; else the std of a speed or velocity that lets filters follow the fixes is "
-            f"{np.hypot(east, north) * (len(c.world.t) / row['fixes']) ** 0.5:.2g} m/s."
+            f"{pace * (len(c.world.t) / row['fixes']) ** 0.5:.2g} m/s."
         )
     if turn is not None and abs(turn) > AXIS_TURN:
         sentences.append(
@@ -381,6 +381,7 @@ def _of_fixes(c: Check) -> list[str]:
     the same time at any speed, or beside it by more than their noise explains, as where the truth has another
     origin."""
     rec, truth, sentences = c.world, c.log.truth, []
+    what = "odometry" if truth is None else "truth"
     off, made, then = causes(c)
     usual = c.fix_noise
     for column, name in enumerate(rec.ids):
@@ -395,7 +396,7 @@ def _of_fixes(c: Check) -> list[str]:
             if (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM:
                 sentences.append(
                     f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
-                    f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {'odometry' if truth is None else 'truth'}: "
+                    f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {what}: "
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
@@ -403,7 +404,7 @@ def _of_fixes(c: Check) -> list[str]:
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             way = "behind" if lag > 0 else "ahead of"
             sentences.append(
-                f"{name}: its fixes are {abs(lag):.0f} s {way} the {'odometry' if truth is None else 'truth'}, which "
+                f"{name}: its fixes are {abs(lag):.0f} s {way} the {what}, which "
                 "they else follow: clocks differ, as by leap seconds, or files of two drives."
             )
             continue

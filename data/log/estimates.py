@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy  # its signals take half a second, and are imported where they are used
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
@@ -14,8 +13,8 @@ from coopoc.world.links import wrap
 from .motion import COURSE, MOVING
 from .residuals import Check, filtered, plane, residual_of
 
-SURE_ERRORS = 4.0
-"""Standard errors beyond which an estimate is significant: of the hundreds in a few logs one exceeds three."""
+SURE_ERRORS, SURE_CLOCK_ERRORS = 4.0, 5.0
+"""Standard errors beyond which an estimate is significant, of many in a few logs; and one of clocks and ranges."""
 LEAST_LAG, LEAST_SCALE, LEAST_TURN, LEAST_DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 BESIDE, BEHIND = 0.1, 0.1
@@ -31,8 +30,10 @@ LEAST_CORRELATION = 0.97
 MIN_OWN_SHARE = 0.02
 """Least share of a cause's sum of squares that the other causes do not explain, so that it can be told from them."""
 OUTLYING, TENTHS, DRIVE_PARTS = 5.0, 10, 40
-"""Multiples of the median residual beyond which one is left out; parts of a drive in which a filter is judged, and those
-whose estimates give the standard error."""
+"""Multiples of the median residual beyond which one is left out; parts of a drive in which a filter is judged, and
+those whose estimates give the standard error."""
+ERRORS_LAST = 1.5
+"""Factor of the standard errors of clocks: errors of two filters may last for most of a short drive."""
 LONG_LAG = 2.0
 """s, from which a lag is searched for: shorter ones are estimated linearly."""
 LONGEST_LAG, LAG_STEP = 60.0, 0.1
@@ -272,7 +273,7 @@ def _polar(turned: complex) -> Floats:
     return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
 
 
-def clocks(c: Check, reference: int | None, alike: bool) -> tuple[Estimate, AnyArray]:
+def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     """By what each vehicle's clock is ahead of that of a reference, or of one that most agree with, s; if `alike`, by
     what share all ranges are too long, and by what they are late, s: (N + 2,), and what a range or direction misses for
     1 of each (L, 2, N + 2).
@@ -306,24 +307,8 @@ def clocks(c: Check, reference: int | None, alike: bool) -> tuple[Estimate, AnyA
     error[seen[seen == reference]] = 0.0
     if reference is None and len(seen):
         apart = np.abs(np.subtract.outer(value[seen], value[seen]))
-        return clocks(c, seen[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))], alike)
-    return Estimate(value, np.hypot(error, _of_filters(c, there, x, z, groups))), made
-
-
-def _of_filters(c: Check, there: Bools, x: Floats, z: Floats, pairs: Ints) -> Floats:
-    """Standard errors (k,) of factors of causes x (M, k) by instruments z (M, k), less means of pairs (M,), by errors
-    of the filters that decay in the time that a fix is remembered."""
-    x, z = _centred(x, pairs), _centred(z, pairs)
-    gain = z @ np.linalg.pinv(z.T @ x).T
-    keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
-    position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
-    variance = np.zeros(x.shape[1])
-    for pair in np.unique(pairs):
-        of_pair = pairs == pair
-        line = np.zeros((len(c.world.t), x.shape[1]))
-        np.add.at(line, c.world.links.step[there][of_pair], gain[of_pair] * np.sqrt(position[of_pair, None]))
-        variance += (2 * line * scipy.signal.lfilter([1.0], [1.0, -keep], line, axis=0) - line**2).sum(axis=0)
-    return np.sqrt(np.maximum(variance, 0.0))
+        return clocks(c, alike, seen[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))])
+    return Estimate(value, ERRORS_LAST * error), made
 
 
 def share(c: Check) -> float:
@@ -352,10 +337,15 @@ def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
     return pd.Series(one + (" to " if directed else " and ") + other, there)
 
 
-def offsets(c: Check, k: int) -> dict[str, tuple[float, float]]:
-    """Pairs -> the median of their residuals of one kind, and its standard error."""
-    names = pairs(c, k, k > 0)
-    return {str(pair): median(c.relative[rows, k]) for pair, rows in names.groupby(names).groups.items()}
+def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
+    """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
+    errors of the filters, which last."""
+    made, lasts, names = {}, share(c), pairs(c, k, k > 0)
+    for pair, rows in names.groupby(names).groups.items():
+        offset, error = median(c.relative[rows, k])
+        position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
+        made[str(pair)] = offset, float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
+    return made
 
 
 def lag_of_fixes(c: Check, column: int) -> float:
@@ -413,12 +403,12 @@ def against_truth(c: Check) -> Check:
 def on_time(c: Check, alike: bool) -> Check:
     """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share, and
     less what wrong ones explain."""
-    (value, error), made = clocks(c, None, alike)
+    (value, error), made = clocks(c, alike)
     size, maybe = len(c.world.ids), np.abs(value) > 2.0 * error
     if alike and not (maybe[size:].any() and abs(value[size]) < UNITS_APART):  # clocks look like it, or undo it
         return on_time(c, False)
     least = np.where(np.arange(size + 2) == size, LEAST_SCALE, LEAST_LAG)
-    off = np.where(np.abs(value) > np.maximum(SURE_ERRORS * error, least), value, 0.0)
+    off = np.where(np.abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ off)
     ranges = tuple(zip(off[size:], error[size:], strict=True))
@@ -431,11 +421,9 @@ def worst(c: Check, column: int) -> tuple[float | None, float]:
     assert c.log.truth is not None
     size, t = dimensions(c.world), c.world.t
     square, stated = np.square(c.x - c.log.truth.position)[:, column, :size], c.variance[:, column, :size]
-    stated = np.where(np.isfinite(square), stated, np.nan)
-    ratios = dict[float, float]()
-    for part in np.array_split(np.arange(len(t)), TENTHS):
-        all_of = np.nansum(stated[part])
-        if all_of > 0:
-            ratios[float(t[part[0]] - t[0])] = float(np.sqrt(np.nansum(square[part]) / all_of))
-    when = max(ratios, key=ratios.__getitem__, default=0.0)
-    return ratios.get(when), when
+    tenths, there = np.arange(len(t)) * TENTHS // len(t), np.isfinite(square)
+    sums = [pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)]
+    ratios = (sums[0] / sums[1])[sums[1] > 0.0]
+    if ratios.empty:
+        return None, 0.0
+    return float(ratios.max() ** 0.5), float(t[tenths == ratios.idxmax()][0] - t[0])

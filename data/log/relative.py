@@ -180,7 +180,7 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
     and standard errors, largest first."""
     named = [
         (pair, offset, error)
-        for pair, (offset, error) in offsets(c, k).items()
+        for pair, (offset, error) in offsets(c, k, stated).items()
         if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated)
     ]
     return sorted(named, key=lambda row: -abs(row[1]))

@@ -22,7 +22,7 @@ TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 GATE_STDS = 5.0
 """Standard deviations of an innovation beyond which the pose filters that check a log leave a measurement out."""
 WILD_STDS, LEAST_NIS = 5.0, 0.04
-"""Multiples of the usual innovation of a vehicle's fixes beyond which one is left out; least that its square is taken for."""
+"""Multiples of the usual innovation of a vehicle's fixes beyond which one is left out; least square of that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,13 +139,13 @@ def _moving(rec: Recording) -> list[int]:
 def without_wild(c: Check) -> Check:
     """The same, less the fixes that are wild, of vehicles whose odometry does not fail."""
     size, rec = dimensions(c.world), c.log.recording
-    square = pd.DataFrame(size * c.normalised).drop(columns=[*map(rec.ids.index, c.failing)])
+    square = pd.DataFrame(size * c.normalised)
+    square[[*map(rec.ids.index, c.failing)]] = np.nan
     wild = square > WILD_STDS**2 * (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS)
-    wild = wild.reindex(columns=range(len(rec.ids)), fill_value=False).to_numpy()
-    if rec.body is not None or not wild.any():
+    if rec.body is not None or not wild.to_numpy().any():
         return c
-    less = replace(rec, gnss=np.where(wild[..., None], np.nan, rec.gnss))
-    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(axis=0), failing=c.failing)
+    less = replace(rec, gnss=np.where(wild.to_numpy()[..., None], np.nan, rec.gnss))
+    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum().to_numpy(), failing=c.failing)
 
 
 def filtered(log: Log) -> Check:
