@@ -63,12 +63,12 @@ class Priors(NamedTuple):
         forget: s, in which what innovations have shown of levels is forgotten; 0 for levels that stay.
     """
 
-    heading: float = 0.1
-    scale: float = 0.1
+    heading: float = 0.05
+    scale: float = 0.05
     lasts: float = 1e5
     clock: float = 0.05
     compass: float = 0.05
-    offset: float = 0.5
+    offset: float = 1.0
     range_scale: float = 0.0
     pair_offset: float = 0.0
     absent: float = 8.0
