@@ -306,7 +306,7 @@ def test_a_lost_message_costs_no_more_than_the_message():
 def mirrored(recording: Recording) -> Recording:
     """Ranges in another unit, azimuths of another sign; a fix of the ego each second."""
     seldom = moved(recording, np.arange(len(recording.t)) % 10 > 0, 0, np.nan)
-    return replace(seldom, relative=recording.relative * [3.0, -1.0, 1.0])
+    return replace(seldom, relative=recording.relative * [2.0, -1.0, 1.0])
 
 
 def failing(recording: Recording) -> Recording:
@@ -329,7 +329,7 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
     "nothing": (S2, CHANNELS["ideal"], lambda r: r),
     "ranges": (S2, CHANNELS["ideal"], lambda r: too_long(r, 0.2)),
     "late": (S2, CHANNELS["slow"], lambda r: r),
-    "mirrored": (replace(S2, gnss_std=(1.0,) * 3), CHANNELS["late"], mirrored),
+    "mirrored": (replace(S2, gnss_std=(2.0,) * 3), CHANNELS["late"], mirrored),
     "failing": (replace(S2, gnss_std=(0.5,) * 3), CHANNELS["late"], failing),
     "tunnel": (S2, CHANNELS["late"], tunnel),
     "lost": (S2, V2X(6, loss=0.3), lambda r: r),

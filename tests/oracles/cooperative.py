@@ -233,7 +233,7 @@ class Oracle:
             **{name: {} for name in tables},
             **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight", "unsaid", "whole"), 0.0),
             **{name: np.zeros(6) for name in ("level", "learned", "information")},
-            **{name: np.zeros(3) for name in ("gap", "cov", "course", "recent")},
+            **{name: np.zeros(3) for name in ("gap", "cov", "off", "course", "recent")},
             **dict.fromkeys(("left", "unused")),
             **{name: [] for name in ("products", "votes", "members")},
             belief=Belief(),
@@ -296,7 +296,7 @@ class Oracle:
         b = copy.deepcopy(self.state.belief)
         self.average(b)
         x = b.at("x", self.ego)
-        self.state.cov = np.diag(b.p[x, x])
+        self.state.cov, self.state.off = np.diag(b.p[x, x]), b.x[x] - self.state.belief.x[x]
         return b.x[x], b.p[x, x]
 
     def compare(self, t, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
@@ -326,10 +326,7 @@ class Oracle:
                 self.state = copy.deepcopy(self.lone)
                 self.doubts, self.last, self.alike = np.zeros(2), max(2 * self.last, 20.0), 0.0
                 self.left = self.last
-        if self.left > 0:
-            x, cov = y, q
-        self.state.cov = np.diag(cov)
-        return x, cov
+        return (y, q) if self.left > 0 else (x, cov)
 
     def average(self, b: Belief):
         life, slot = self.life, self.state.slot
@@ -478,7 +475,10 @@ class Oracle:
             if j not in others or again or self.contradicted(t, j):
                 self.dismiss(j, j in others, outvoted)
         dt = self.dt
-        s.agreed += dt * (s.hits.get("fix", 0) == 0)
+        if s.hits.get(self.ego, 0) == 0:
+            s.agreed += dt
+        elif s.agreed < ESTABLISHED:
+            s.agreed = max(s.agreed - 1.5 * dt, 0.0)
         s.unseen += dt
         u, q = self.motion(t)
         u, q = self.steady(t, self.ego, u, louder * q)
@@ -488,9 +488,9 @@ class Oracle:
             across = min(SIDEWAYS + (TURNS * s.blind) ** 2, 1.0)
             b.p[x, x] += slip * (across * np.eye(3) + np.outer(s.course, s.course))
         s.made = s.made + q.sum()
+        grown, way = max(0.0 if self.ego in s.vague else self.own_variance() - s.whole, q.sum()), 0.0
+        s.cov = s.cov + (grown / 3 if slip else q)
         if s.left:
-            grown = 0.0 if self.ego in s.vague else self.own_variance() - s.whole
-            grown, way = max(grown, q.sum()), 0.0
             if slip:
                 corrections = louder * self.grown if self.corrected_now else 0.0
                 grown, way = max(q.sum() - 3 * corrections, 0.0), self.by[t] * dt if self.corrected_now else 0.0
@@ -553,8 +553,7 @@ class Oracle:
         if self.priors.fix_gate and self.ego not in s.vague:
             self.go_back(t, fix, rows)
             rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
-        s.share = share = self.use_fix(t, self.ego, rows, True)
-        s.hits["fix"] = s.hits["fix"] + 1 if share < 1 else 0
+        s.share = self.use_fix(t, self.ego, rows, True)
         self.corrected()
 
     def go_back(self, t, fix: Floats, rows: list[Any]):
@@ -580,7 +579,7 @@ class Oracle:
             for j in list(s.members):
                 self.dismiss(j, j in self.messages, False)
             self.place(x, p)
-            s.left = None
+            s.left, s.cov, s.off = None, np.full(3, p), np.zeros(3)
         elif near and s.agree > AWAY:
             s.left = None
 
@@ -603,7 +602,13 @@ class Oracle:
         return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
 
     def use_fix(self, t, j, rows: list[Any], again: bool) -> float:
-        """The share of its information that is used; trust may be revoked."""
+        """The share of its information that is used."""
+        share, hits = self.share_of(t, j, rows, again), self.state.hits
+        hits[j] = hits.get(j, 0) + 1 if share < 1 else 0
+        return share
+
+    def share_of(self, t, j, rows: list[Any], again: bool) -> float:
+        """That share, the less, the more in a row were rejected; trust may be revoked."""
         s, g, b = self.state, self.priors, self.state.belief
         used = [c for c, row in enumerate(rows) if row is not None]
         h = np.array([b.row(rows[c][0], c) for c in used])
@@ -617,7 +622,7 @@ class Oracle:
         judged = j != self.ego or any(i in s.last for i in s.members)
         doubtful = g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows))
         if doubtful:
-            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= 0
+            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= -FIX_GATE / 2
             if supported and j in s.trusted:
                 s.revoked[j] = s.revoked.get(j, 0) + 1
             elif not supported:
@@ -633,15 +638,20 @@ class Oracle:
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
         mine, noise, locked = np.trace(own), r.sum(), s.locked
         if not judged:
-            mine, noise = s.cov.sum(), noise * exp(-s.level[3])
+            mine, noise = s.cov[used].sum(), noise * exp(-s.level[3])
         gain = mine / (mine + noise)
-        q = min(square, float(gap @ gap) / SLIP)
+        q = square
+        if j == self.ego and len(self.fix_terms(j)) == 1:
+            q = float((((gap - s.off[used]) ** 2) / (s.cov[used] + r)).sum())
+        q = min(q, float(gap @ gap) / SLIP)
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
             if q > g.fix_gate and hits < PATIENCE:
                 share = g.fix_gate / q if q < HARD_REJECT_FACTOR * g.fix_gate else 0.0
+            share /= 1 + s.hits.get(j, 0) if share < 1 and (j == self.ego or self.trusted() > 2) else 1
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
-            if not judged and s.agreed >= ESTABLISHED and s.level[3] <= 2.9:
+            holds = s.agreed >= ESTABLISHED or (s.agreed > 0 and s.jumped)
+            if not judged and holds and s.level[3] <= 2.9:
                 locked[j] = min(locked[j], MAX_LOCKOUT)
         if share:
             b.updates(h, z, r, share=share)
@@ -729,7 +739,7 @@ class Oracle:
         self.place(there, spread)
         self.doubt(self.ego)
         s.revoked[self.ego] = s.revoked.get(self.ego, 0) + 1
-        s.left, s.agreed, s.hits["fix"] = None, 0.0, 0
+        s.left, s.agreed, s.hits[self.ego] = None, 0.0, 0
 
     def start(self, t, fix: Floats) -> bool:
         """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""
@@ -742,7 +752,7 @@ class Oracle:
         if self.ego not in s.trusted and votes[0] < max(len(votes), 2):
             return False
         self.place(places[best if elsewhere else 0][0], FLAT)
-        s.joined[self.ego], s.hits["fix"] = t, 0
+        s.joined[self.ego], s.hits[self.ego] = t, 0
         if s.left:
             moved = self.dt * self.motion(t)[0]
             s.left = s.left[0] + moved, s.left[1]
@@ -815,7 +825,7 @@ class Oracle:
         if self.trusted():
             return False
         if self.ego in s.trusted:
-            return bool(s.hits["fix"] > 0 and s.locked.get(self.ego, 0.0) >= PATIENCE)
+            return bool(s.hits[self.ego] > 0 and s.locked.get(self.ego, 0.0) >= PATIENCE)
         b, noise = s.belief, (self.r[t, self.ego] @ self.white) / 3
         error = b.x[b.at("b", self.ego)]
         apart = [float(np.square(error - b.x[b.at("b", j)]).sum()) for j in held]
@@ -911,7 +921,7 @@ class Oracle:
         taken = {s.slot[i] for i in s.members} if s.members else set()
         s.slot[j] = next(k for k in range(1, 10**6) if k not in taken)
         s.members.append(j)
-        s.joined[j], s.hits[("relative", j)] = t, [0, 0, 0]
+        s.joined[j], s.hits[("relative", j)], s.hits[j] = t, [0, 0, 0], 0
         s.since[j] = t if message is None else message.step
         b.add(("x", j), self.near(j), FLAT)
         if message is not None:

@@ -22,10 +22,12 @@ from .cooperative_state import (
     AGREED,
     ANSWER,
     AT,
+    BARE,
     BY_FIXES,
     CLOCK,
     CORRECTED,
     DT,
+    ESTABLISHED,
     EXTRA_VARIANCE,
     FIX,
     FIX_VARIANCE,
@@ -40,9 +42,11 @@ from .cooperative_state import (
     MORE,
     MOTION,
     MOTION_VARIANCE,
+    OFFSET,
     ORDER,
     OUT,
     OWN,
+    REJECTED,
     SINCE_FIX,
     SOLO,
     SPAN,
@@ -312,7 +316,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
             doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
     f.ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
     if doubts[ALONE_FOR] > 0.0:
-        for i in range(15):
+        for i in range(12):
             f.ego[ANSWER + i] = alone.ego[ANSWER + i]
 
 
@@ -324,7 +328,10 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     scale_motion_noise(f, own, rows, vehicles, count)
     f.ego[SPAN] = own[DT]
     f.ego[SINCE_FIX] += own[DT]
-    f.ego[AGREED] += own[DT] if f.who[0, HITS] == 0 else 0.0
+    if f.who[0, REJECTED] == 0:
+        f.ego[AGREED] += own[DT]
+    elif f.ego[AGREED] < ESTABLISHED:
+        f.ego[AGREED] = max(f.ego[AGREED] - 1.5 * own[DT], 0.0)
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]
     replace_implausible_velocity(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
@@ -402,8 +409,7 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
             fix_terms(f, 0)
             q = innovate(f.g, f.h)
     spoken = speak_for(f, model, own, rows, count, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
-    f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q, spoken >= 0.0)
-    f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
+    use_fix(f, model, 0, True, q, spoken >= -0.5 * FIX_GATE)  # two that contradict one another cancel
     corrected(f)
 
 
@@ -437,7 +443,7 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
         set_trust(f, f.who[0, VEHICLE], 1.0, model.own)
         clear(g, 0)
         for c in range(3):
-            g.x[c] = left[c]
+            g.x[c], f.ego[BARE + c], f.ego[OFFSET + c] = left[c], spread, 0.0
         widen(g, 0, spread)
         f.member[0, LOCKED] = 0.0
     if what != KEEP:

@@ -19,6 +19,7 @@ from .cooperative_state import (
     MOTION,
     MOTION_VARIANCE,
     PACE,
+    REJECTED,
     SINCE,
     SLIPS,
     SPAN,
@@ -197,6 +198,7 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
     f.member[k, WHEN] = f.ego[CLOCK] - age
     for c in range(3):
         f.who[k, HITS + c], f.member[k, WAY + c] = 0, 0.0
+    f.who[k, REJECTED] = 0
     first = insert(g, k, PLACE)
     stand(f, rows, k)
     if age > 0.0:

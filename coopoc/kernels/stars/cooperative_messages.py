@@ -31,8 +31,10 @@ from .cooperative_state import (
     NO_POSITION,
     NOISE,
     ODOMETER,
+    OFFSET,
     OUT,
     PACE,
+    REJECTED,
     REVOKED,
     SLIPS,
     SOLO,
@@ -71,6 +73,7 @@ from .gaussian import (
     correct,
     distance,
     expect,
+    has,
     innovate,
     insert_from_measurement,
     remove,
@@ -79,7 +82,7 @@ from .gaussian import (
 )
 from .lasting import usual_error
 from .messages import block_at, three_of, vector_at
-from .otherwise import LOUDEST_NOISE, drive, learn_fix, score, turned
+from .otherwise import JUMPED, LOUDEST_NOISE, drive, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -186,7 +189,7 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
         known = again and f.member[k, EXTRA_VARIANCE] == 0.0
         if known and status[TRUSTED] > 0.0 and sum(f.h.block[MEASURED:]) == 3:
             learn_fix(f, model, MESSAGES)
-        f.member[k, OUT + 3] = use_fix(f, model, k, again, q, True)
+        use_fix(f, model, k, again, q, True)
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
@@ -240,9 +243,17 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
 
 
 @inner
-def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> float:
+def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> None:
+    """Update by the rows of a vehicle's fix, and count those that are rejected in a row."""
+    f.member[k, OUT + 3] = share = update_by_fix(f, model, k, again, q, supported)
+    f.who[k, REJECTED] = f.who[k, REJECTED] + 1 if share < 1.0 else 0
+
+
+@inside
+def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
-    information that it keeps.
+    information that it keeps. What makes a receiver err lasts: the n-th fix in a row beyond the gate counts 1 / n, of a
+    neighbour where two others are trusted.
 
     Args:
         f: filter.
@@ -272,7 +283,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: b
             correct(g, h, 1.0)
         return 0.0 if supported else 1.0
     gap = vector_at(h.three, GAP // 3)
-    q = min(q, inner_product(gap, gap) / SLIP)
+    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / SLIP)
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
@@ -281,12 +292,29 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: b
     share = 1.0
     if model.fix_gate > 0.0:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
+        lasts = share < 1.0 and (k == 0 or heard(f, True) > 2)
+        share /= 1.0 + f.who[k, REJECTED] if lasts else 1.0
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
-        if not judged and f.ego[AGREED] >= ESTABLISHED and f.ego[LEVEL + FIXES] <= LOUDEST_NOISE:
+        holds = f.ego[AGREED] >= ESTABLISHED or (f.ego[AGREED] > 0.0 and f.ego[JUMPED] > 0.0)
+        if not judged and holds and f.ego[LEVEL + FIXES] <= LOUDEST_NOISE:
             f.member[0, LOCKED] = min(f.member[0, LOCKED], MAX_LOCKOUT)
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
     return share
+
+
+@part
+def as_answered(f: Filter, q: float) -> float:
+    """Squared normalised distance of the ego's fix from the answer, that of the state being `q`: what is averaged over
+    errors that may not be there is surer of them. Of fixes whose errors are states it is `q`."""
+    g, h, square = f.g, f.h, 0.0
+    if has(g, 0, ERROR) or has(g, 0, COMMON):
+        return q
+    for c in range(3):
+        if h.block[MEASURED + c]:
+            gap = h.three[GAP + c] - f.ego[OFFSET + c]
+            square += gap * gap / (f.ego[BARE + c] + h.three[VARIANCE + c])
+    return square
 
 
 @inside
@@ -398,7 +426,7 @@ def doubt_ego(f: Filter, model: Model) -> None:
     widen(g, 0, spread)
     set_trust(f, ego, 0.0, TAU**2 + model.own)
     f.status[ego, REVOKED] += 1.0
-    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], f.who[0, HITS] = NOTHING, 0.0, 0.0, 0
+    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], f.who[0, REJECTED] = NOTHING, 0.0, 0.0, 0
 
 
 @part

@@ -108,10 +108,10 @@ class Model(NamedTuple):
     forget: float
 
 
-VEHICLE, INPUT, ORDER, HITS, WHO = 0, 1, 2, 3, 6
+VEHICLE, INPUT, ORDER, HITS, REJECTED, WHO = 0, 1, 2, 3, 6, 7
 """Of a slot: its vehicle, ABSENT for none, its row of the step's input, ABSENT for none, and how often in a row each of
-three components exceeded its gate; the ego's first counts its fixes. ORDER lists the slots of the members, nearest
-first: a gate depends on what was used before, not on how members are numbered."""
+three components, and its fixes, exceeded their gate. ORDER lists the slots of the members, nearest first: a gate
+depends on what was used before, not on how members are numbered."""
 WAY, AT, WHEN, JOINED, EXTRA_VARIANCE, LOCKED, OUT, MEMBER = 0, 3, 6, 7, 8, 9, 10, 14
 """Of a member: the way m that it has moved since it was at its position; where relative measurements are linear m; when
 it was there, s, which is when it sent its newest message; the step at which it joined; variance of its position beyond
@@ -121,16 +121,16 @@ was: the ego's are those of its fix."""
 NO_VOTES = (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, BARE, LEFT = 20, 26, 32, 38, 51, 54, 63, 66
-AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, EGO = 73, 74, 75, 76, 84, 93, 94
+AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, EGO = 73, 74, 75, 76, 84, 93, 94, 97
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
-is otherwise than assumed, and position m and covariance m^2; the variances of that before `lasting` adds to them; and
-where it would be m, had fixes not led it away, the variance of that m^2, NOTHING for none, the two numbers of
-`gate.remember` on it, and how far the ego has driven since m; for how long s fixes have agreed with its position; s
-since the last fix; by how many m^2 a step's motion is more uncertain where this try takes it as fixes correct it, else
-0; eight numbers of `lasting`; nine of `gate.vote`; and by how many m^2, axes together, the ego's position is more
-uncertain than its covariance says."""
+is otherwise than assumed, and position m and covariance m^2; the variances of that before `lasting` adds to them, and
+of the ego as it moves on; and where it would be m, had fixes not led it away, the variance of that m^2, NOTHING for
+none, the two numbers of `gate.remember` on it, and how far the ego has driven since m; for how much longer s fixes have
+agreed with its position than not; s since the last fix; by how many m^2 a step's motion is more uncertain where this
+try takes it as fixes correct it, else 0; eight numbers of `lasting`; nine of `gate.vote`; and by how many m^2, axes
+together, the ego's position is more uncertain than its covariance says; and the answer m less the position."""
 
 
 class Filter(NamedTuple):
@@ -245,7 +245,7 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
             best, most = i, agree
     if own_votes < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
         return False
-    f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, HITS], f.member[0, LOCKED] = (
+    f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, REJECTED], f.member[0, LOCKED] = (
         model.flat,
         f.ego[STEPS],
         0,
@@ -327,7 +327,7 @@ def needs_restart(f: Filter, own: Floats) -> bool:
     if heard(f, True):
         return False
     if f.status[f.who[0, VEHICLE], TRUSTED] > 0.0:
-        return bool(f.who[0, HITS] > 0 and f.member[0, LOCKED] >= PATIENCE)
+        return bool(f.who[0, REJECTED] > 0 and f.member[0, LOCKED] >= PATIENCE)
     for k in range(1, len(f.who)):
         last = k if f.who[k, VEHICLE] >= 0 and f.status[f.who[k, VEHICLE], USED] > -math.inf else last
     error, noise = vector_at(f.g.x, f.g.block[0, ERROR]), sum(vector_at(own, FIX_VARIANCE // 3)) / 3.0

@@ -66,6 +66,7 @@ from .cooperative_state import (
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
+    OFFSET,
     OWN,
     SINCE_FIX,
     SLIPPING,
@@ -191,6 +192,7 @@ def average(f: Filter, model: Model) -> None:
         average_over_all(f, model, own)
     for c in range(3):
         f.ego[BARE + c] = f.ego[COVARIANCE + 4 * c]
+        f.ego[OFFSET + c] = f.ego[ANSWER + c] - g.x[c]
     for kind in range(5):
         i = scaled if kind == 4 else own + kind - (3 if kind < 2 else 2)
         there = n > scaled if kind == 4 else scaled > own if kind >= 2 else own > 3
@@ -455,6 +457,8 @@ def moved(f: Filter, own: Floats) -> None:
     p, before = ego_variance(f), f.ego[WHOLE]
     f.ego[UNSAID] *= p / before if p < before else 1.0  # errors of a heading cancel on a circle
     more, f.ego[WHOLE] = max(p - before, q), p
+    for c in range(3):
+        f.ego[BARE + c] += more / 3.0 if f.ego[NOW] > 0.0 else own[MOTION_VARIANCE + c]
     if f.ego[NOW] > 0.0:  # where odometry alone leads
         level = math.exp(f.ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
         more = max(q - 3.0 * level * f.ego[CORRECTED], 0.0)
