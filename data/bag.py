@@ -1,7 +1,7 @@
 """ROS 1 and 2 bags as rows of a log: NavSatFix, Odometry, Imu, PoseStamped and Range, one namespace per vehicle."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import pandas as pd
 from coopoc.arrays import one_of
 from coopoc.errors import InputError, MissingLibraryError, said, unknown
 
-from .cells import numeric
 from .log.units import Rows, Summary, of_kinds
 
 ORIENTATION = "orientation.x orientation.y orientation.z orientation.w"
@@ -28,11 +27,6 @@ position_covariance",
 }
 """Type of a message -> what it is, and its fields that are read."""
 TRUTH = ("truth", "ground_truth", "groundtruth")
-STAMPS = {
-    **dict.fromkeys(("header.stamp.sec", "header.stamp.secs"), 1.0),
-    **dict.fromkeys(("header.stamp.nanosec", "header.stamp.nsec", "header.stamp.nsecs", "header.stamp"), 1e-9),
-}
-"""Column of a topic that was written as a table, as several programs call it -> s."""
 FIELDS = {
     "latitude": "latitude",
     "longitude": "longitude",
@@ -187,27 +181,6 @@ def _by_number(frame: pd.DataFrame, summary: Summary) -> pd.DataFrame:
     if same:
         summary.assume(f"ends of ranges by their numbers: {', '.join(f'{a} is {b}' for a, b in same.items())}")
     return frame.replace({"vehicle": same, "partner": same})
-
-
-def _field(column: str) -> str:
-    """Name of a field, which several programs write as field.position_covariance0, or end it with [0]."""
-    return re.sub(r"covariance\[?(\d+)\]?$", r"covariance_\1", column.removeprefix("field."))
-
-
-def is_topic(columns: Iterable[str]) -> bool:
-    """Whether columns are those of a topic that was written as a table."""
-    return not STAMPS.keys().isdisjoint(map(_field, columns))
-
-
-def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd.DataFrame:
-    """A topic that was written as a table, a column per field of the message, as a wide table of a log."""
-    frame = frame.rename(columns=_field)
-    t = sum(unit * numeric(frame, name, file) for name, unit in STAMPS.items() if name in frame)
-    known = {*FIELDS, *UNMEASURED, "status.status", "position_covariance_type", *ORIENTATION.split()}
-    if true:
-        known.update(POSE.split(), POSE.replace("pose.", "pose.pose.").split())
-    topic = {name: numeric(frame, name, file) for name in frame if name in known}
-    return kinds_of(pd.DataFrame({"t": t, **topic}, frame.index), true, summary, file)
 
 
 def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> pd.DataFrame:

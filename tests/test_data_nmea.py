@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pymap3d
 import pytest
 from conftest import measured, refused
@@ -220,57 +219,14 @@ def test_motion_capture_and_radios_of_a_public_bag():
     assert np.isfinite(log.recording.relative[0, :, 0]).sum() > 0.95 * sum(map(len, errors))
 
 
-COVARIANCE = [[f"position_covariance{form.format(at)}" for at in (0, 4, 8)] for form in ("[{}]", "{}")]
-STAMPS = ("header.stamp.sec", "header.stamp.nanosec"), ("field.header.stamp.secs", "field.header.stamp.nsecs")
-
-
-def test_topics_as_tables_are_the_bag(tmp_path):
-    """A folder per namespace, a column per field, variances as one of two programs names them; speeds stay along the
-    vehicle, whose imu has the heading."""
-    fleet = drive(2, steps=80, start=1.7e9)
-    for k, name in enumerate(fleet.ids):
-        lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, k].T, 48.14, 11.58, 560.0)
-        u = fleet.velocity[:, k]
-        yaw, sec = np.arctan2(u[:, 1], u[:, 0]), np.floor(fleet.t + 1e-6).astype(int)
-        stamp = dict(zip(STAMPS[k], (sec, np.rint(1e9 * (fleet.t - sec)).astype(int)), strict=True))
-        status = -1 * (np.arange(80) == 40)
-        variance = dict(zip(COVARIANCE[k], (k + 1) * np.array([0.25, 0.36, 0]), strict=True))
-        turned = {
-            "orientation.x": 0,
-            "orientation.y": 0,
-            "orientation.z": np.sin(yaw / 2),
-            "orientation.w": np.cos(yaw / 2),
-        }
-        topics = {
-            "gps/fix": {**variance, "status.status": status, "latitude": lat, "longitude": lon, "altitude": h},
-            "odom": {
-                "pose.pose.position.x": 0.0,
-                "twist.twist.linear.x": np.hypot(*u[:, :2].T),
-                "twist.covariance[0]": 0.04,
-            },
-            "imu": {**turned, "angular_velocity.z": np.gradient(np.unwrap(yaw), 0.1)},
-        }
-        for topic, columns in topics.items():
-            file = tmp_path / "dump" / name / f"{topic}.csv"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            pd.DataFrame(stamp | columns).to_csv(file, index=False)
-    log = read_log(tmp_path / "dump", origin=(48.14, 11.58, 560.0), std={"z": 1.5, "range": 0.15})
-    assert co.read_log(tmp_path / "dump").recording.ids == log.recording.ids == ("car0", "car1")
-    assert log.summary.refused["fixes that the receiver calls invalid"][0] == 2
-    there = np.isfinite(log.recording.gnss[0, :, :, 0])
-    assert_allclose(log.recording.gnss[0][there], fleet.position[there], atol=1e-5)
-    assert_allclose(log.recording.velocity[0, 2:, :, :2], fleet.velocity[2:, :, :2], atol=0.06)
-    sensors = log.recording.sensors
-    assert (*sensors.gnss_std, sensors.velocity_floor) == pytest.approx(np.sqrt([1.5 * 0.25, 1.5 * 0.36, 2.25, 0.04]))
-
-
 def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):
     pytest.importorskip("rosbags")
     fleet = drive(1, steps=60, start=1.7e9)
-    write_bag(tmp_path / "drive", fleet, 2, late=0.25)
+    write_bag(tmp_path / "drive", fleet, 2, late=0.25, invalid=40)
     by_header, received = (read_log(tmp_path / "drive", dt=0.1, stamps=stamps) for stamps in ("header", "received"))
     assert received.recording.t[0] - by_header.recording.t[0] == pytest.approx(0.25, abs=1e-5)
     assert "times are those of stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)
+    assert by_header.summary.refused["fixes that the receiver calls invalid"][0] == 1
 
 
 def write_bag(
@@ -279,6 +235,7 @@ def write_bag(
     ros: int,
     names: Mapping[str, str] = MappingProxyType({}),
     late: float = 0.0,
+    invalid: int = -1,
 ):
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
@@ -321,7 +278,7 @@ def write_bag(
                 lat, lon, h = pymap3d.enu2geodetic(*x, 48.14, 11.58, 560.0)
                 yaw = float(np.arctan2(u[1], u[0]))
                 quaternion = turned(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
-                status = kind["sensor_msgs/msg/NavSatStatus"](0, 1)
+                status = kind["sensor_msgs/msg/NavSatStatus"](-1 if step == invalid else 0, 1)
                 pose = kind["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turned(0.0, 0.0, 0.0, 1.0))
                 twist = kind["geometry_msgs/msg/Twist"](
                     vector(float(np.hypot(*u[:2])), 0.0, 0.0), vector(0.0, 0.0, 0.0)

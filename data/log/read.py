@@ -29,7 +29,7 @@ from ..assemble import (
     interpolate,
     longest_gap,
 )
-from ..bag import is_topic, read_bag
+from ..bag import read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
@@ -363,12 +363,11 @@ def _every_file(path: Path) -> list[Path]:
 
 
 def _files(path: Path) -> list[Path]:
-    """Files of a folder; below it topics that were written as tables, and those of a folder per vehicle where it has
-    none itself but a truth."""
+    """Files of a folder, and those of a folder per vehicle where it has none itself but a truth."""
     every = _every_file(path)
     bare = not any(_is_bag(file) or (file.parent == path and not TRUTH.fullmatch(file.stem)) for file in every)
     bare = bare and any(map(is_log, every))
-    return sorted(file for file in every if bare or file.parent == path or is_topic(headers(file)))
+    return sorted(file for file in every if bare or file.parent == path)
 
 
 def _check_one_drive(rows: Rows, path: Path) -> None:

@@ -10,7 +10,6 @@ import pandas as pd
 from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError, suggestion
 
-from ..bag import TRUTH, is_topic, of_topic
 from ..cells import (
     filled,
     headers,
@@ -69,8 +68,6 @@ def read_log_table(
     """
     file = path.name
     frame = read_frame(path, *(columns.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
-    if is_topic(map(str, frame)):
-        frame = of_topic(frame, file, summary, path.stem.lower() in TRUTH)
     frame = named_columns(frame, columns, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame:
         placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
