@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import holed, standing, textbook
+from conftest import holed, standing, textbook, without
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
@@ -63,10 +63,7 @@ def partial(recording: Recording) -> Recording:
 
 def gappy(fleet: Fleet) -> Fleet:
     """Vehicles that appear and vanish."""
-    position, velocity = fleet.position.copy(), fleet.velocity.copy()
-    position[:20, 2:5], velocity[:20, 2:5] = np.nan, np.nan
-    position[40:, 5:7], velocity[40:, 5:7] = np.nan, np.nan
-    return replace(fleet, position=position, velocity=velocity)
+    return without(fleet, (slice(20), slice(2, 5)), (slice(40, None), slice(5, 7)))
 
 
 def known_of(method: Any, recording: Recording) -> NoiseModel:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import holed, measured, refused, textbook
-from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles.solo import filterpys
 from shell import ran
 
 from coopoc import V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Sensors, StarStream, observe
@@ -71,14 +71,6 @@ def test_a_net_step_by_step_is_its_track(known, crossing):
         assert_allclose(x, track.x[0, t, 0], atol=1e-5)
 
 
-def peer(x: Floats, known: NoiseModel) -> Any:
-    """filterpy's filter of a position with a velocity as input."""
-    found = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    found.x, found.P = x.copy(), np.diag(known.gnss_variance)
-    found.H = np.eye(3)
-    return found
-
-
 @pytest.mark.parametrize(
     ("start", "near"),
     [(textbook(Kalman(FITTED)).start, 1e-9), (partial(StarStream, CooperativeFilter(FITTED, AS_STATED)), 1e-4)],
@@ -88,7 +80,7 @@ def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start, near
     star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
     draw, stream = np.random.default_rng(0), start(interval=0.1)
     stream.step(Z, U, 0.1)
-    theirs, t, path = peer(Z, FITTED), [0.0, 0.1], [0 * U, 0.1 * U]
+    theirs, t, path = filterpys(Z, np.diag(FITTED.gnss_variance), 0.1), [0.0, 0.1], [0 * U, 0.1 * U]
     for k in range(200):
         dt, u, z = draw.uniform(0.02, 0.5), draw.normal(0, 9, 3), Z + draw.normal(0, 3, 3)
         t, path = [*t, t[-1] + dt], [*path, path[-1] + dt * u]
