@@ -158,7 +158,11 @@ def test_recipes_follow_the_paper():
     assert len({replace(r.schedule, epochs=1) for r in (fed, centralised, individual)}) == 1
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIGHTS.glob("*.safetensors")))
+EACH = pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIGHTS.glob("*.safetensors")))
+"""Of the weights that are shipped."""
+
+
+@EACH
 def test_shipped_weights_hold_over_unseen_drives(name):
     """They trained on pieces of 100 steps and other vehicles; here are 900 steps, and no run may drift away."""
     fleet, method = load_fleet("town10"), load_method(name)
@@ -172,7 +176,7 @@ def test_shipped_weights_hold_over_unseen_drives(name):
     assert found.notes == ()
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIGHTS.glob("*.safetensors")))
+@EACH
 def test_cards_say_what_was_trained_and_how_well(name):
     checkpoint = load(recipes.WEIGHTS / f"{name}.safetensors")
     card = checkpoint.card

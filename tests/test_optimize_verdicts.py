@@ -66,9 +66,12 @@ def test_a_strict_minimum_is_one_wherever_the_axes_are(degrees, offset, backend)
         assert solve(problem, backend, throw=False).status is Status.SOLVED
 
 
+ANCHORS = np.array([[0, 0], [10, 0.0]])
+
+
 def test_a_saddle_between_two_anchors_is_one():
     """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line."""
-    problem = ranged(np.array([[0, 0], [10, 0.0]]), np.array([5, 0.0]), np.full(2, 15.0), 1.0)
+    problem = ranged(ANCHORS, np.array([5, 0.0]), np.full(2, 15.0), 1.0)
     assert solve(problem, throw=False).status is Status.SADDLE
     unknown = ranged(np.zeros((1, 2)), np.array([3, 4.0]), np.array([5.0]), 1.0)
     assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
@@ -76,7 +79,7 @@ def test_a_saddle_between_two_anchors_is_one():
 
 def test_ranges_that_do_not_meet_are_noted():
     """Closed form: ranges of 3 m to anchors 10 m apart are each 2 m off in the middle, and nothing is spare."""
-    found = solve(ranged(np.array([[0, 0], [10, 0.0]]), np.array([5, 1.0]), np.full(2, 3.0), 1.0))
+    found = solve(ranged(ANCHORS, np.array([5, 1.0]), np.full(2, 3.0), 1.0))
     assert found.cost == pytest.approx(4.0)
     assert "explains 0" in found.notes[-1]
 
@@ -89,8 +92,7 @@ def test_odometry_of_micrometres_beside_a_fix_of_a_metre_is_known(std):
 
 
 def test_a_certified_mirror_image_is_not_unique():
-    anchors = np.array([[0, 0], [10, 0.0]])
-    pair = ranged(anchors, np.array([5, 1.0]), np.array([7, 8.0]), 1.0)
+    pair = ranged(ANCHORS, np.array([5, 1.0]), np.array([7, 8.0]), 1.0)
     verdict = certify(pair, solve(pair))
     assert (verdict.certified, verdict.unique) == (True, False)
     assert "mirror image" in str(verdict)
