@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopoc import Fleet, Links, Recording, load_fleet
+from coopoc import V2X, Fleet, Links, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Bools, Floats
 from coopoc.data.fetch import public
 from coopoc.data.fleet_files import write_table
@@ -156,6 +156,12 @@ def formation() -> Fleet:
 @pytest.fixture(scope="session")
 def crossing() -> Fleet:
     return crossing_fleet()
+
+
+@pytest.fixture(scope="session")
+def dense(formation: Fleet) -> Recording:
+    """Ten neighbours at 22 m."""
+    return observe(formation.between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=4, observers=[0])
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,19 @@ PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], s
 """Two points with fixes."""
 
 
+def torn(loss: Loss | None = None) -> Problem:
+    """A point that two displacements from a held one place 140 m apart."""
+    held = Problem(("o", "a"), x0=np.eye(2, 3), fixed=(0,))
+    return held.add("displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0, loss=loss)
+
+
+def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """x after a step of the numbers that can move; in the plane a derivative there is one by v."""
+    step = np.zeros(problem.movable.shape)
+    step[problem.movable] = v
+    return problem.space.retract(x, step)
+
+
 def random_graph(
     seed: int,
     dimension: int = 2,

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from conftest import refused
+from random_graphs import PAIR, torn
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
@@ -110,7 +111,6 @@ def test_wrong_loop_closures_are_those_that_gtsam_finds():
     assert ours.position == pytest.approx(np.array([theirs.atPose2(k).translation() for k in range(21)]), abs=1e-4)
 
 
-PAIR = Problem("ab").add("position", ["a", "b"], np.zeros((2, 3)), std=1.0)
 LOST = PAIR.add("range", ("a", "b"), 1.0, std=1.0, loss=Loss("huber", 1.0))
 
 
@@ -135,12 +135,9 @@ def test_wrong_input_says_what_to_do(make, field):
 
 def test_gnc_that_rejects_every_measurement_is_reported():
     """Two displacements 140 m apart, both candidates: no start believes either, and then the point is free."""
-    torn = Problem(("o", "a"), x0=np.eye(2, 3), fixed=(0,)).add(
-        "displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0
-    )
-    assert solve_gnc(torn, [0], throw=False).status is Status.RANK_DEFICIENT
+    assert solve_gnc(torn(), [0], throw=False).status is Status.RANK_DEFICIENT
     with pytest.raises(InputError):
-        solve_gnc(torn, [0])
+        solve_gnc(torn(), [0])
 
 
 def test_a_limit_of_rounds_is_a_status(monkeypatch):

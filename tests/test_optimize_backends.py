@@ -22,12 +22,6 @@ OTHERS = [name for name in LOCAL if name != "gauss-newton"]
 
 
 @pytest.fixture(scope="module")
-def dense(formation):
-    """Ten neighbours at 22 m."""
-    return observe(formation.between(0, 40), S2, V2X.ideal(10), runs=4, observers=[0])
-
-
-@pytest.fixture(scope="module")
 def crossing_recording(crossing):
     """Neighbours that come and go."""
     return observe(crossing, S2, V2X(max_neighbours=6, radius=60), runs=2, observers=[0, 3])

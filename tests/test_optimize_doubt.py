@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import refused
 from graph_files import write_graph
-from random_graphs import PAIR, random_graph
+from random_graphs import PAIR, random_graph, torn
 from scipy.stats import chi2
 
 import coopoc as co
@@ -54,10 +54,8 @@ def test_what_is_not_measured_is_no_number(noise):
 
 
 def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones():
-    torn = Problem(("o", "a"), x0=np.eye(2, 3), fixed=(0,))
-    torn = torn.add("displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0, loss=Loss("truncated", 1.0))
     with refused(r"a can move|truncated loss rejects 2 of 2.*larger scale"):
-        solve(torn)
+        solve(torn(Loss("truncated", 1.0)))
 
 
 def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path):

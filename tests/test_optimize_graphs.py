@@ -11,7 +11,7 @@ import pytest
 from conftest import measured, refused
 from hard_graphs import cropped
 from oracles.bayes_tree import bayes_tree_marginals
-from random_graphs import random_graph
+from random_graphs import moved, random_graph
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 from unseen_graphs import drone, range_aided, world
@@ -26,13 +26,6 @@ from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.starts.initial import directed
-
-
-def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """x after a step of the numbers that can move; in the plane a derivative there is one by v."""
-    step = np.zeros(problem.movable.shape)
-    step[problem.movable] = v
-    return problem.space.retract(x, step)
 
 
 def test_a_newton_step_promises_the_square_of_its_decrement():

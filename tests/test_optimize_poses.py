@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from conftest import measured, refused
+from random_graphs import moved
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -63,18 +64,16 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     problem, truth = everything(dimension)
     found = solve(problem, backend)
     space, movable = problem.space, problem.movable.ravel()
-
-    def residual(step):
-        whole = np.zeros(movable.size)
-        whole[movable] = step
-        return problem.whiten(space.retract(truth, whole.reshape(9, -1)))[0]
-
-    theirs = least_squares(residual, np.zeros(movable.sum()), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    theirs = least_squares(
+        lambda v: problem.whiten(moved(problem, truth, v))[0],
+        np.zeros(movable.sum()),
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    )
     assert found.status is Status.SOLVED
     assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
-    step = np.zeros(movable.size)
-    step[movable] = theirs.x
-    assert found.x == pytest.approx(space.retract(truth, step.reshape(9, -1)), abs=1e-6)
+    assert found.x == pytest.approx(moved(problem, truth, theirs.x), abs=1e-6)
     J = problem.whiten(found.x)[1].toarray()[:, movable]
     cov = np.zeros((movable.size, movable.size))
     cov[np.ix_(movable, movable)] = np.linalg.inv(J.T @ J)

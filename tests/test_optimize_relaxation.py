@@ -132,12 +132,13 @@ def test_the_bound_is_that_of_the_programme_written_out(d, up):
         assert shor(problem, refine=False).lower_bound == pytest.approx(by_hand(problem), rel=2e-5, abs=1e-6)
 
 
+SWARMS = (swarm, partial(swarm, d=2), partial(swarm, stretch=UP))
+
+
 @pytest.mark.parametrize(
     "make",
     [
-        swarm,
-        partial(swarm, d=2),
-        partial(swarm, stretch=UP),
+        *SWARMS,
         partial(swarm, d=2, stretch=3.0),
         two_robots,
         partial(two_robots, d=3, prior=True),
@@ -165,9 +166,7 @@ def test_no_point_beats_the_bounds(make, seed):
     assert relaxation.solution.cost <= relaxation.cost * (1 + 1e-9) + 1e-12
 
 
-@pytest.mark.parametrize(
-    "make", [swarm, partial(swarm, d=2), partial(swarm, stretch=UP), partial(two_robots, prior=True)]
-)
+@pytest.mark.parametrize("make", [*SWARMS, partial(two_robots, prior=True)])
 @pytest.mark.parametrize("seed", range(2))
 def test_tight_relaxations_reach_what_brute_force_reaches(make, seed):
     """scipy.optimize.least_squares from random starts finds nothing better, and its best is our solution."""
@@ -180,9 +179,7 @@ def test_tight_relaxations_reach_what_brute_force_reaches(make, seed):
         assert relaxed.lower_bound == pytest.approx(found, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    "make", [two_robots, partial(two_robots, d=3), partial(two_robots, fixed=True), swarm, partial(swarm, stretch=UP)]
-)
+@pytest.mark.parametrize("make", [two_robots, partial(two_robots, d=3), partial(two_robots, fixed=True), *SWARMS])
 def test_the_elimination_is_numpys(make, monkeypatch):
     """C and its products by numpy.linalg.lstsq, eigenvalues by eigh and by Lanczos."""
     form = quadratic(make(0))
