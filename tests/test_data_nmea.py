@@ -14,19 +14,13 @@ import numpy as np
 import pymap3d
 import pytest
 from conftest import measured, refused
+from fuzz.good_files import sentence
 from logs import drive
 from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
-
-
-def sentence(text: str) -> str:
-    check = 0
-    for letter in text:
-        check ^= ord(letter)
-    return f"${text}*{check:02X}\r\n"
 
 
 def degrees(value: float, wide: int) -> str:

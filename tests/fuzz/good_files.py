@@ -65,7 +65,7 @@ WIDE = "time,lat,lon,alt,speed,heading_deg,partner,range\n" + "".join(
 )
 
 
-def _sentence(text: str) -> str:
+def sentence(text: str) -> str:
     check = 0
     for letter in text:
         check ^= ord(letter)
@@ -73,10 +73,10 @@ def _sentence(text: str) -> str:
 
 
 NMEA = "".join(
-    _sentence(f"GNGGA,23595{k}.00,4808.4{k}00,N,01134.8000,E,4,20,0.6,520.0,M,46.0,M,,")
-    + _sentence(f"GNGST,23595{k}.00,,,,,0.020,0.010,0.050")
-    + _sentence(f"GNRMC,23595{k}.00,A,4808.4{k}00,N,01134.8000,E,5.0,359.0,280224,,,R")
-    + _sentence("GNVTG,359.0,T,,M,5.0,N,9.3,K,A")
+    sentence(f"GNGGA,23595{k}.00,4808.4{k}00,N,01134.8000,E,4,20,0.6,520.0,M,46.0,M,,")
+    + sentence(f"GNGST,23595{k}.00,,,,,0.020,0.010,0.050")
+    + sentence(f"GNRMC,23595{k}.00,A,4808.4{k}00,N,01134.8000,E,5.0,359.0,280224,,,R")
+    + sentence("GNVTG,359.0,T,,M,5.0,N,9.3,K,A")
     for k in range(5, 9)
 )
 CELL = "0123456789abcdef0123"
