@@ -13,7 +13,7 @@ from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
 
 PLAIN = {"print_time": False}, {"print_level": 0}
-"""Options of CasADi's plugin, and of FATROP behind it."""
+"""Options of CasADi's plugin, and of IPOPT behind it."""
 
 
 def casadi_exact(problems: list[Problem]) -> Job:
@@ -39,7 +39,7 @@ def casadi_exact(problems: list[Problem]) -> Job:
         casadi.SX.sym(name, 3, n) for name, n in (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS))
     )
     nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, relative), "f": cost(x, fix, relative)}
-    solver = casadi.nlpsol("solver", "fatrop", nlp, {**quiet, "fatrop": inner})
+    solver = casadi.nlpsol("solver", "ipopt", nlp, {**quiet, "ipopt": inner})
 
     numbers = [(np.concatenate([fix.ravel(), seen.ravel()]), start.ravel()) for fix, seen, start in given]
 
@@ -62,12 +62,12 @@ def casadi_exact(problems: list[Problem]) -> Job:
             model.minimize(0.5 * total)
             for node, at in zip(nodes, start, strict=True):
                 model.set_initial(node, at)
-            model.solver("fatrop", quiet, inner)
+            model.solver("ipopt", quiet, inner)
             answer = model.solve()
             found.append([answer.value(node) for node in nodes])
         return np.stack(found)
 
-    job = "casadi fatrop, snapshot, exact"
+    job = "casadi ipopt, snapshot, exact"
     return Job(
         [
             Row(job, "ours, solve() one by one", 20, ours(problems[:20], "casadi")),

@@ -2,11 +2,9 @@
 
 The expressions (see `symbolic`) are differentiated once per structure; measurements, weights, bounds and the start are
 parameters, so that the next problem of the structure pays for its solution only. Poses are steps in a chart around a
-centre that moves to each answer until the step is below the tolerance. FATROP (interior point, dense elimination) takes
-small problems without inequalities, IPOPT the others and those where FATROP fails.
+centre that moves to each answer until the step is below the tolerance. IPOPT (interior point) solves all of them.
 """
 
-from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
 from typing import Any
@@ -21,9 +19,6 @@ from ..model.derivatives import Structure, expressions
 from ..model.factor import stacked, steerable
 from ..model.problem import Problem
 
-FATROP_NUMBERS = 200
-"""Numbers that can move up to which FATROP is faster than IPOPT."""
-SUCCESS = "Solve_Succeeded"
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
 QUIET: dict[str, Any] = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
@@ -41,7 +36,6 @@ IPOPT = {
     "acceptable_compl_inf_tol": 1e-17,
 }
 """For a cost scaled to a curvature of 1; what `tol` asks may lie below rounding, hence the acceptable level."""
-FATROP: dict[str, Any] = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "acceptable_iter": 3}
 
 
 def solver(
@@ -72,31 +66,13 @@ def solver(
             f"must be at most the {moving} numbers that can move",
             "Leave out those that follow from the others.",
         )
-    methods = ("fatrop", "ipopt") if moving <= FATROP_NUMBERS and np.array_equal(*sides) else ("ipopt",)
-    for method in methods:
-        end = _run(form, programme(form, method, int(max_iterations), get_ident()), problem, x, sides, tolerance)
-        if end.extras["return_status"] == SUCCESS:
-            break
-    return replace(end, extras=end.extras | {"method": method})
-
-
-def _run(
-    form: Structure,
-    nlp: Any,
-    problem: Problem,
-    x: Floats,
-    sides: tuple[Floats, Floats],
-    tolerance: float,
-) -> SolverResult:
-    """Solve around x (n, ambient), and for poses again around the answer until it stays."""
+    nlp = programme(form, int(max_iterations), get_ident())
     space, free, count, rounds = form.space, form.movable, 0, 0
     multipliers: Any = 0.0
-    while rounds < 10:
+    while rounds < 10:  # for poses again around the answer until it stays
         end = nlp(p=_numbers(problem, x), lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
         status = stats["return_status"]
-        if isinstance(status, int):  # FATROP has one number for all that is not a success
-            status = SUCCESS if stats["success"] else "Not_Solved"
         before, step, count, rounds = x, np.zeros(free.shape), count + int(stats["iter_count"]), rounds + 1
         step[free] = at
         if np.isfinite(at).all():
@@ -133,18 +109,14 @@ def _exponential(step: Floats, dimension: int) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def programme(structure: Structure, method: str, max_iterations: int, thread: int) -> Any:
-    """CasADi's nlpsol of a structure by "fatrop" or "ipopt", its own for each thread, kept for the next problems that
-    share it."""
+def programme(structure: Structure, max_iterations: int, thread: int) -> Any:
+    """CasADi's nlpsol of a structure, its own for each thread, kept for the next problems that share it."""
     import casadi as ca
 
     symbols, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**symbols, "p": ca.vertcat(symbols["p"], scale), "f": scale * symbols["f"]}
-    own = {"ipopt": IPOPT, "fatrop": FATROP}[method]
-    options: dict[str, Any] = {**QUIET, method: {**own, "max_iter": max_iterations}}
-    if method == "fatrop":
-        options["structure_detection"] = "none"
-    return ca.nlpsol("solver", method, nlp, options)
+    options: dict[str, Any] = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
+    return ca.nlpsol("solver", "ipopt", nlp, options)
 
 
 BACKEND = Backend(
