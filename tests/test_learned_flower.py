@@ -64,6 +64,11 @@ def honest(job: Job, fleet: Fleet, vehicle: int) -> Node:
     return lambda message: app(message, Context(1, vehicle, {}, RecordDict(), {}))
 
 
+def vehicles(job: Job, fleet: Fleet, count: int) -> dict[int, Node]:
+    """The first ones by their number."""
+    return {i: honest(job, fleet, i) for i in range(count)}
+
+
 def room(nodes: Mapping[int, Node]) -> Any:
     """A Flower grid without a network: every node answers at once, in the opposite order."""
     from flwr.serverapp import Grid
@@ -104,7 +109,7 @@ def test_the_rounds_are_those_of_federate(rule):
     """Weights and losses to rounding, and the round that is kept, whatever the order in which answers arrive."""
     job, fleet = job_of(TINY | {"aggregate": rule}), drives()
     expected = in_process(job, fleet)
-    _, found = deployed(job, {i: honest(job, fleet, i) for i in range(4)})
+    _, found = deployed(job, vehicles(job, fleet, 4))
     assert found.names == expected.names
     for mine, theirs in zip(found.history[1:], expected.history[1:], strict=True):
         torch.testing.assert_close(mine.weights, theirs.weights, rtol=0, atol=1e-6)
@@ -174,7 +179,7 @@ def test_bad_answers_are_rejected_and_training_goes_on():
         return reply
 
     byzantine |= {17 + k: partial(changed, change=change) for k, change in enumerate(more)}
-    rows, _ = deployed(job, {i: honest(job, fleet, i) for i in range(4)} | byzantine)
+    rows, _ = deployed(job, vehicles(job, fleet, 4) | byzantine)
     for row, theirs in zip(rows[1:], expected.history[1:], strict=True):
         assert set(row.training_loss) == set(fleet.ids)
         torch.testing.assert_close(row.weights, theirs.weights, rtol=0, atol=1e-6)
@@ -215,9 +220,7 @@ def test_no_node_answers_in_place_of_another():
 def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most():
     job, fleet = job_of(TINY), drives(3)
     theta = in_process(job, fleet).history[0].weights
-    rows, found = deployed(
-        job, {i: honest(job, fleet, i) for i in range(3)} | {3: sends("d", theta, num_examples=2**30)}
-    )
+    rows, found = deployed(job, vehicles(job, fleet, 3) | {3: sends("d", theta, num_examples=2**30)})
     pieces = rows[1].pieces
     assert pieces["d"] == 10 * int(np.median([pieces["a"], pieces["b"], pieces["c"], 2**30]))
     assert found.history[1].note == f"d claims {2**30} pieces and counts with {pieces['d']}"
@@ -227,7 +230,7 @@ def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most():
 def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate, least):
     """Refused at the start; where too few answers are accepted later, the weights stay, and the round has a note."""
     job, fleet = job_of(TINY | {"aggregate": aggregate}), drives(least)
-    few = {i: honest(job, fleet, i) for i in range(least - 1)}
+    few = vehicles(job, fleet, least - 1)
     with refused(f"takes at least {least}"):
         deployed(job, few)
     with refused(f"takes at least {least}"):
@@ -240,7 +243,7 @@ def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate, least):
 
 def test_a_silent_client_is_absent_and_welcome_back():
     job, fleet = job_of(TINY), drives(3)
-    nodes = {i: honest(job, fleet, i) for i in range(3)}
+    nodes = vehicles(job, fleet, 3)
 
     def sometimes(message):
         number: Any = message.content["config"]

@@ -22,6 +22,7 @@ import pytest
 from conftest import winding
 from shell import ROOT, ran
 from test_learned_flower import in_process
+from test_learned_flower import pytestmark as flower
 
 from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
@@ -33,10 +34,9 @@ from coopoc.learned.recipes import Job, job_clients, untrained
 TINY = {"local-epochs": 1, "piece": 10, "net-in-mult": 2, "net-out-mult": 1}
 CHANGE = " ".join(f"{key}={value}" for key, value in TINY.items())
 pytestmark = [
+    *flower,
     pytest.mark.slow,
-    pytest.mark.skipif(importlib.util.find_spec("flwr") is None, reason="flwr is not installed: coopoc[flower]"),
     pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="no /proc: processes cannot be counted or searched"),
-    pytest.mark.filterwarnings("ignore:'click.utils:DeprecationWarning"),
 ]
 
 
