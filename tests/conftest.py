@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from coopoc import V2X, Fleet, Links, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Bools, Floats
@@ -61,6 +62,11 @@ def same_minimum(theirs: Any, ours: Any):
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)
     assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-6)
+
+
+def half_width(runs: Floats) -> float:
+    """Of the interval in which the mean of runs (R,) lies in 99 % of all cases, by Student's t."""
+    return float(stats.t.ppf(0.995, len(runs) - 1) * runs.std(ddof=1) / np.sqrt(len(runs)))
 
 
 def textbook(method: Any) -> Any:

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused, standing, textbook, without
+from conftest import coming_and_going, half_width, refused, standing, textbook, without
 from oracles.batch_smoother import batch_smoother
-from scipy import stats
 from scipy.optimize import least_squares
 
 from coopoc import V2X, BatchSmoother, Fleet, NoiseModel, Recording, Sensors, observe
@@ -103,7 +102,7 @@ def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy):
     square = (rt_le(track, fleet) ** 2).mean(axis=1)
     cov = fleet_bound(fleet, SPEED, v2x, smoothing=True)
     bound = np.mean([bound_rt_le(cov[:, e]) ** 2 for e in (0, 4)])
-    half = stats.t.ppf(0.995, 29) * square.std(ddof=1) / np.sqrt(30)
+    half = half_width(square)
     assert square.mean() + half > bound
     assert square.mean() - half < 1.1 * bound
 

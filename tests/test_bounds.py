@@ -6,8 +6,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused, standing
-from scipy import stats
+from conftest import coming_and_going, half_width, refused, standing
 from test_pose_methods import convoy
 
 import coopoc as co
@@ -127,8 +126,7 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(nei
 
 def near(square: np.ndarray, bound: float):
     """Squared errors of 40 runs are not below a bound beyond their interval, and not far above it."""
-    half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
-    assert square.mean() + half > bound
+    assert square.mean() + half_width(square) > bound
     assert square.mean() < 1.15 * bound
 
 
@@ -271,7 +269,7 @@ def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method, k, ma
         (position, np.trace(bound[10:, :3, :3], axis1=1, axis2=2).mean()),
         (heading, bound[10:, 3, 3].mean()),
     ):
-        half = stats.t.ppf(0.995, 119) * square.std(ddof=1) / np.sqrt(120)
+        half = half_width(square)
         assert square.mean() + half > least
         if method.fusion == "joint":
             assert square.mean() - half < 1.02 * least

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from filterpy.kalman import KalmanFilter
 from logs import bends, drive, fixes, long, motion, observed, ranges, write
 from numpy.testing import assert_allclose
+from oracles.solo import filterpys
 
 import coopoc as co
 from coopoc.cli import _status
@@ -147,10 +147,7 @@ def test_innovations_are_filterpys(folders):
     track = co.Kalman()(rec, ["car0"])
     found, squares = fix_innovations(track, rec), normalised_innovations(track, rec)
     q = rec.sensors.motion_std(rec.velocity, rec.dt)[0, :, 0] ** 2
-    kf = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    kf.x, kf.F, kf.H, kf.B = rec.gnss[0, 0, 0], np.eye(3), np.eye(3), rec.dt * np.eye(3)
-    kf.R = np.diag(np.square(rec.sensors.gnss_std))
-    kf.P = kf.R.copy()
+    kf = filterpys(rec.gnss[0, 0, 0], np.diag(np.square(rec.sensors.gnss_std)), rec.dt)
     for t in range(1, 100):
         kf.predict(u=rec.velocity[0, t, 0], Q=np.diag(q[t]))
         kf.update(rec.gnss[0, t, 0])
