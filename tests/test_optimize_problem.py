@@ -131,16 +131,11 @@ BAD = {
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
-    "coincident": (
-        lambda: solve(replace(PAIR.add("range", ("a", "b"), 5.0, std=1.0), x0=np.zeros((2, 3)))),
-        "a and b coincide",
-    ),
     "coincident, bounded": (
         lambda: solve(replace(PAIR, x0=np.zeros((2, 3))).constrain("range", ("a", "b"), 4.0, 5.0)),
         "a and b coincide",
     ),
     "nothing to relax": (lambda: quadratic(Problem("a")), "no measurements"),
-    "unobservable": (lambda: solve(Problem("ab").add("displacement", ("a", "b"), [5, 0, 0], std=1.0)), "move freely"),
     "two runs": (lambda: Problem("a").add("position", "a", np.zeros((2, 1, 3)), std=1.0), "a problem for each run"),
 }
 
