@@ -1,13 +1,12 @@
 """report: one self-contained page from folders of studies; it needs neither network nor what ran."""
 
 import base64
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from ..arrays import listed
 from ..errors import InputError
@@ -16,7 +15,7 @@ from ..text import uncontrolled
 from .manifest import environments
 from .publish import views
 from .results import Results
-from .style import TERMS, look, title, words
+from .style import look, title, words
 from .tables import Table
 
 OWN = Path(__file__).parent
@@ -27,8 +26,6 @@ _MIME = {
     "png": "image/png",
     "svg": "image/svg+xml",
 }
-
-_TERM = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(TERMS, key=len, reverse=True)))})(?![\w-])")
 
 
 def report(
@@ -138,7 +135,6 @@ def _template() -> jinja2.Template:
     )
     jinja.filters["named"] = _named
     jinja.filters["shown"] = _shown
-    jinja.filters["explained"] = explained
     return jinja.get_template("report.html.j2")
 
 
@@ -152,21 +148,3 @@ def _shown(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(_shown, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def explained(text: object) -> Markup:
-    """Text as HTML whose terms carry their meaning, each where it first stands.
-
-    >>> explained("KF < KF")
-    Markup('<abbr title="Kalman filter">KF</abbr> &lt; KF')
-    """
-    earlier: set[str] = set()
-
-    def marked(match: re.Match[str]) -> str:
-        term = match[0]
-        if term in earlier:
-            return term
-        earlier.add(term)
-        return f'<abbr title="{escape(TERMS[term])}">{term}</abbr>'
-
-    return Markup(_TERM.sub(marked, str(escape(uncontrolled(str(text))))))
