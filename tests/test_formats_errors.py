@@ -77,6 +77,7 @@ BAD_G2O = {
     "wrong kind": ("EDGE_SE3:QUAT 0 1", "EDGE_SE3:QUAT 0 2", "line 5 = vertex 2", "must be a pose"),
     "unknown record": ("FIX", "EDGE_2", "line 8 = EDGE_2", "PARAMS_SE3OFFSET, FIX"),
     "mixed": ("VERTEX_TRACKXYZ 2 3 4 5", "VERTEX_XY 2 3 4", "line 3 = VERTEX_XY", "3-D as line 1"),
+    "edges alone": (G2O[: G2O.index("PARAMS")], "", "g2o = 0 vertices", "a line for every vertex"),
 }
 
 

@@ -164,8 +164,9 @@ def test_marginals_are_those_of_gtsams_bayes_tree(dimension):
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
 def test_marginals_of_a_chain_in_the_plane_are_those_of_its_noise(objective, tmp_path):
     """Closed form: four steps of 1 m, 0.1 m and 0.2 rad each; beside a constraint that does not hold, too."""
-    steps = "\n".join(f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 25" for k in range(4))
-    (path := tmp_path / "chain.g2o").write_text(steps)
+    vertices = [f"VERTEX_SE2 {k} 0 0 0" for k in range(5)]
+    steps = [f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 25" for k in range(4)]
+    (path := tmp_path / "chain.g2o").write_text("\n".join(vertices + steps))
     problem = read_graph(path, objective)
     x = solve(problem).x
     for each in (problem, problem.constrain("range", (0, 4), upper=9.0)):

@@ -31,7 +31,6 @@ GRAMMAR = Grammar(
     noise="information",
     name=_name,
     others=("PARAMS_SE3OFFSET", "FIX"),
-    implied=True,
 )
 
 
@@ -50,8 +49,7 @@ def read_g2o(path: str | Path, repair: bool = False) -> Graph:
             `EDGE_SE3_PRIOR i offset x y z qx qy qz qw info`, `EDGE_POINTXYZ_PRIOR i x y z info`,
             `PARAMS_SE3OFFSET id x y z qx qy qz qw` (the identity, where an edge uses it); `FIX id ...`; and
             `EDGE_RANGE i j r information`, which g2o lacks and its users add under this name.
-            m and rad; info is the upper triangle by rows. A file of edges alone has the vertices that they name,
-            nowhere yet.
+            m and rad; info is the upper triangle by rows.
         repair: take the nearest positive definite matrix for an information that is none, and say so in Graph.notes.
 
     Raises:

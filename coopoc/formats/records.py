@@ -94,7 +94,6 @@ class Grammar:
         noise: "covariance" or "information".
         name: (word, pose or point) -> the name of that vertex, "" if the word is malformed.
         others: tags that the format's own reader takes care of.
-        implied: a file without any vertex has those that its edges name, in the order of their numbers.
     """
 
     format: str
@@ -102,7 +101,6 @@ class Grammar:
     noise: str
     name: Callable[[str, str], str]
     others: tuple[str, ...] = ()
-    implied: bool = False
 
     def form(self, tag: str) -> str:
         """Form of a line with a tag."""
@@ -179,31 +177,15 @@ class Grammar:
             of_kind = rows.setdefault(record.kind, _Rows(tag, [], []))
             of_kind.lines.append(number)
             of_kind.words.append(words)
-        if not {"pose", "point"} & set(rows) and not (self.implied and dimension):
+        if not {"pose", "point"} & set(rows):
             hint = "Check that the file is complete."
             raise InputError(file, "0 vertices", "must have a line for every vertex", hint)
         return dimension, rows
-
-    def _implied(self, rows: Mapping[str, _Rows], dimension: int) -> tuple[list[int], list[str], dict[str, Any]]:
-        """`_vertices` that edges name, nowhere yet; what only ranges name is a pose."""
-        named = dict[str, tuple[int, bool]]()
-        for kind in [kind for kind in ENDS if kind in rows]:
-            for line, words in zip(rows[kind].lines, rows[kind].words, strict=True):
-                for role, word in zip(ENDS[kind], words[1:], strict=False):
-                    named.setdefault(word, (line, role != "point"))
-        order = sorted(named, key=lambda word: (len(word), word))
-        lines, poses = zip(*(named[word] for word in order), strict=True)
-        is_pose, nowhere = np.array(poses), np.full((len(order), dimension), np.nan)
-        turn = np.full((len(order), 1 if dimension == 2 else 4), np.nan)
-        turn[~is_pose] = 0.0 if dimension == 2 else np.eye(4)[3]
-        return list(lines), order, {"is_pose": is_pose, "position": nowhere, "orientation": turn}
 
     def _vertices(
         self, file: str, rows: Mapping[str, _Rows], dimension: int
     ) -> tuple[list[int], list[str], dict[str, Any]]:
         """Lines, words for and arrays of the poses and points, in the order of the file."""
-        if not {"pose", "point"} & set(rows):
-            return self._implied(rows, dimension)
         parts = []
         for kind in ("pose", "point"):
             if kind in rows:
