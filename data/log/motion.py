@@ -439,10 +439,9 @@ def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, s
     gnss, summary, rows = np.full((len(steps.grid), 3), np.nan), steps.summary, only(rows, "x")
     nearest, _ = steps.nearest(fixes.t)
     kept, step, lag = _nearest_of_each(fixes, there, steps)
-    absent = (nearest >= 0) & ~there[nearest]
-    beside = ~np.isin(np.arange(len(nearest)), kept) & (nearest >= 0) & ~absent
+    absent = ~there[nearest]
+    beside = ~np.isin(np.arange(len(nearest)), kept) & ~absent
     for why, left in (
-        ("fixes outside the recording", nearest < 0),
         ("fixes in gaps of the odometry", absent),
         ("fixes beside a nearer one of the same step", beside),
     ):

@@ -284,8 +284,7 @@ class Summary:
     @property
     def unread(self) -> str:
         """Sentences on columns that are of no kind."""
-        truth = " A truth is another table: truth=FILE." * ("tru" in self.columns or "gt" in self.columns)
-        hint = f"Name what is meant with columns= or kinds=.{truth}"
+        hint = "Name what is meant with columns= or kinds=. A truth is another table: truth=FILE."
         return f"columns not read: {self.columns}. {hint}" if self.columns else ""
 
     @property
