@@ -137,7 +137,8 @@ class CooperativeFilter(Checked):
       ego's own receiver, too, where there are neighbours, unless these put it where its fix is: then it goes there.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
       exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$; that of a component far beyond
-      it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`). A member that is
+      it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`); the n-th fix in a row
+      counts 1 / n, and alone those that jumped wait as long as others had agreed, less a third. A member that is
       contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew. Velocities that
       no vehicle can have reached are replaced by the last ones.
     - *Levels*: the variances of the ego's fixes, its neighbours' fixes, ranges, azimuths, inclinations and motions
