@@ -1,6 +1,6 @@
 """Figures of a study: a metric over an axis, and its bytes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..text import picture
 from .numbers import Number, Results, Where, interval, mean, ran
-from .plot import Plot, canvas, legend, plain_log, strokes
-from .style import Panel, words
+from .plot import Plot, canvas, legend, name_of, plain_log, strokes
+from .style import Panel, look, words
 
 __all__ = ["Plot", "curves", "pareto", "sweep"]
 
@@ -64,23 +64,31 @@ def pareto(results: Results, caption: str, x: str = "bytes_per_second", where: W
     for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
         of = dict(zip(names, key, strict=True))
         points = sorted(zip(group["bytes"], group["mean"], strict=True))
-        marks = [(sent, y) for sent, y in points if sent]
+        marks = {(sent, k): y for k, (sent, y) in enumerate(points) if sent}  # several may cost the same
         alone = not marks or of["method"] == "bound"
         shown.append((of, min(y for _, y in points) if alone else marks))
-    shown.sort(key=lambda line: not isinstance(line[1], list))
+    drawn = {id(of): points for of, points in shown}
+    groups, _ = _coinciding([("", shown)], log=True)
+    groups.sort(key=lambda alike: not isinstance(drawn[id(alike[0])], Mapping))
     with canvas(width=7.0) as (figure, panel):
-        for line, points in shown:
-            if not isinstance(points, list):
+        for line, *_ in groups:
+            points = drawn[id(line)]
+            if not isinstance(points, Mapping):
                 _draw(panel, line, points)
                 continue
-            panel.plot(*zip(*points, strict=True), **{**strokes(line), "linestyle": "none"})
-            best = [p for k, p in enumerate(points) if all(p[1] < other[1] for other in points[:k])]
+            sent = [(at, y) for (at, _), y in points.items()]
+            panel.plot(*zip(*sent, strict=True), **{**strokes(line), "linestyle": "none"})
+            best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
             panel.plot(*zip(*best, strict=True), **{**strokes(line), "marker": "", "linewidth": 0.8})
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
-        _name_alike(panel, [(line, dict(at) if isinstance(at, list) else at) for line, at in shown])
         panel.set(xlabel=words(x), ylabel=words("rt_le_m"))
-        legend(panel, [line for line, _ in shown])
+        also = {
+            name_of(alike[0]): f" ({alike[0].get('noise_model')}{_joined(alike).removeprefix(_joined(alike[:1]))})"
+            for alike in groups
+            if len(alike) > 1
+        }
+        legend(panel, [alike[0] for alike in groups], also)
     return Plot(figure, caption)
 
 
@@ -131,17 +139,30 @@ def curves(
             shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
     if not any(drawn for _, drawn in shown):
         return None
+    coinciding, near = _coinciding(shown, log)
+    groups = {id(group[0]): group for group in coinciding}
     size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": 3.1}
     with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
-        named = list[dict[str, Any]]()
+        named, also = list[dict[str, Any]](), dict[str, str]()
         for axis, (panel, drawn) in zip(axes, shown, strict=True):
             for of, points in drawn:
+                if id(of) not in groups:
+                    continue
                 names = {name: of[name] for name in ("method", "noise_model") if name in of}
                 if len(models) < 2 and of.get("method") != "bound":
                     names["noise_model"] = "none"
-                own = {"label": _name(of)} if labelled else {}
-                _draw(axis, names, points, own | {name: of[name] for name in STYLE if name in of})
+                text = _joined(groups[id(of)], models)
+                style = {name: of[name] for name in STYLE if name in of}
+                if labelled or len(groups[id(of)]) > 1:
+                    style["label"] = text if labelled else f"_{text}"
+                _draw(axis, names, points, style)
                 named += [names] if names not in named else []
+                more, model = text.removeprefix(_joined([of])), str(of.get("noise_model"))
+                more = f"\n{model}{more}" if more and model in models and len(models) > 1 else more
+                if more not in also.setdefault(name_of(names), ""):
+                    also[name_of(names)] += more
+            alone = [(of, points) for of, points in drawn if id(of) in groups and isinstance(points, Mapping)]
+            _name_alike(axis, alone, log, near)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if logx:
                 plain_log(axis.xaxis)
@@ -153,12 +174,10 @@ def curves(
             plain_log(axes[0].yaxis)
         else:
             axes[0].set_ylim(0)
-        for axis, (_, drawn) in zip(axes, shown, strict=True):
-            _name_alike(axis, drawn)
         if labelled:
             axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
         else:
-            legend(axes[-1], named)
+            legend(axes[-1], named, also)
     return Plot(figure, caption)
 
 
@@ -167,45 +186,66 @@ def _where(of: Where) -> Where:
     return {name: value for name, value in of.items() if name not in STYLE}
 
 
-LINE_SHARE = 0.009
-"""Share of the height of a panel, a line's width: lines within it of each other are named together."""
-
-
-def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]]) -> None:
-    """Name lines together at their ends that coincide, but for bounds.
+def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near: float) -> None:
+    """Name lines together at their ends that coincide in this panel alone.
 
     >>> from matplotlib.figure import Figure
     >>> axes = Figure().subplots()
-    >>> _name_alike(axes, [({"label": name}, {0: 1.0, 7: 2.0}) for name in "AB"])
-    >>> axes.texts[0].get_text(), axes.texts[0].xy
-    ('A = B', (7, 2.0))
+    >>> _name_alike(axes, [({"label": name}, {0: 1.0, 7: 2.0}) for name in "AB"], log=False, near=0.1)
+    >>> axes.texts[0].xy
+    (7, 2.0)
     """
-    last = max((list(points)[-1] for _, points in drawn if isinstance(points, Mapping)), default=1.0)
-    lines = [(of, points if isinstance(points, Mapping) else {last: points}) for of, points in drawn]
-    lines = [(of, points) for of, points in lines if of.get("method") != "bound"]
-    height = axes.yaxis.get_transform().transform
-    heights = [height(np.array([*map(_mean, points.values())])) for _, points in lines]
-    near, groups = LINE_SHARE * np.ptp(height(np.array(axes.get_ylim()))), list[list[int]]()
-    for k, (_, points) in enumerate(lines):
-        for group in groups:
-            same = points.keys() == lines[group[0]][1].keys()
-            if same and np.abs(heights[k] - heights[group[0]]).max() <= near:
-                group.append(k)
-                break
-        else:
-            groups.append([k])
-    for group in groups:
+    for group in _coinciding([("", drawn)], log, near)[0]:
         if len(group) > 1:
-            x, y = [*lines[group[0]][1].items()][-1]
+            x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
             halo = [withStroke(linewidth=2, foreground="white")]
             offset: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right"}
-            names = " = ".join(_name(lines[k][0]) for k in group)
-            axes.annotate(names, (x, _mean(y)), fontsize=7, path_effects=halo, **offset)
+            axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **offset)
 
 
-def _name(of: Where) -> str:
-    """The label of a line."""
-    return str(of.get("label") or strokes(of)["label"].removeprefix("_"))
+LINE_SHARE = 0.009
+"""Share of the height of a panel, a line's width: lines within it in every panel are drawn and named as one, in one
+panel they are named together."""
+
+
+def _coinciding(shown: Sequence[Any], log: bool, near: float | None = None) -> tuple[list[list[Where]], float]:
+    """Lines, each with those that lie near it at every point of every panel, and what is near: by default a line's
+    width of what all span, from zero or in the logarithm. A bound stands alone."""
+    lines: dict[int, tuple[Where, dict[Any, float]]] = {}
+    for panel, (_, drawn) in enumerate(shown):
+        for of, points in drawn:
+            values = points if isinstance(points, Mapping) else {"": points}
+            heights = {(panel, x): np.log(_mean(v)) if log else _mean(v) for x, v in values.items()}
+            lines.setdefault(id(of), (of, {}))[1].update(heights)
+    if near is None:
+        every = [y for _, heights in lines.values() for y in heights.values()]
+        near = LINE_SHARE * (max(every) - (min(every) if log else 0.0))
+    groups: list[list[Where]] = []
+    for of, heights in lines.values():
+        for group in groups:
+            other = lines[id(group[0])][1]
+            same = heights.keys() == other.keys() and all(abs(heights[at] - y) <= near for at, y in other.items())
+            if same and "bound" not in (of.get("method"), group[0].get("method")):
+                group.append(of)
+                break
+        else:
+            groups.append([of])
+    return groups, near
+
+
+def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
+    """Labels of lines that are drawn as one: what they begin with once, their noise models where there are several.
+
+    >>> _joined([{"label": "Net of three"}, {"label": "Net of two"}])
+    'Net of three, two'
+    """
+    first, *others = (str(of.get("label") or look(name_of(of)).label) for of in lines)
+    start = first[: first.rfind(" ") + 1]
+    if start and all(other.startswith(start) for other in others):
+        return ", ".join([first, *(other.removeprefix(start) for other in others)])
+    named = [str(of.get("noise_model")) for of in lines[1:]]
+    shown = [f"{n}, {m}" if len(models) > 1 and m in models else n for n, m in zip(others, named, strict=True)]
+    return " = ".join([first, *shown])
 
 
 def _line_names(results: Results, *across: str) -> list[str]:

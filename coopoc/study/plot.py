@@ -82,17 +82,18 @@ def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
     shown, model = look(name_of(names)), str(names.get("noise_model"))
     bound = ":" if model == "with its past" else "--"
     dashes = bound if name_of(names) == "bound" else line(model)
-    text = f"_{shown.label}" + (f", {model}" if model in ("identity", "fitted", "oracle", "with its past") else "")
+    text = f"_{shown.label}" + (f", {model}" if model in ("identity", "fitted", "with its past") else "")
     look_of = {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
     return {**look_of, "label": text}  # legends of matplotlib's own leave it out
 
 
-def legend(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
+def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None) -> None:
     """Draw the legend at the right: one entry per method and bound, and one per line style where noise models differ.
 
     Args:
         axes: panel.
         lines: names (method, noise_model) of the lines in it.
+        words: method -> text after its label.
     """
     if not any(lines):
         return
@@ -101,13 +102,16 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
     styles: dict[Any, list[str]] = {}
     for names in lines:
         method, model = name_of(names), str(names.get("noise_model", "none"))
-        text = look(method).label
+        text = look(method).label + (words or {}).get(method, "")
         if method == "bound":
             text += f", {model}" if len(bounds) > 1 else ""
         elif "method" in names and model != "none" and model not in styles.setdefault(line(model), []):
             styles[line(model)].append(model)
         entries.setdefault(text, strokes(names if method == "bound" or "method" not in names else {"method": method}))
-    handles = [Line2D([], [], **{**options, "label": picture(text)}) for text, options in entries.items()]
+    handles = [
+        Line2D([], [], **{**options, "label": "\n".join(map(picture, text.split("\n")))})
+        for text, options in entries.items()
+    ]
     if len(styles) > 1:
         grey = {dashes: picture(" / ".join(models)) for dashes, models in styles.items()}
         handles += [Line2D([], [], color="#555555", linestyle=dashes, label=text) for dashes, text in grey.items()]
