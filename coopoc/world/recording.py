@@ -249,11 +249,6 @@ class Recording:
         """(R, L, 3) `relative` without azimuths of what is straight above or below, as estimators take it."""
         return drop_steep_azimuths(self.relative)
 
-    def neighbours(self, ego: int | str) -> Ints:
-        """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
-        (column,) = columns("ego", [ego], self.ids)
-        return np.bincount(self.links.step[self.links.of(column)], minlength=len(self.t)).astype(np.int64)
-
     def observing(self, egos: Vehicles) -> list[int]:
         """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""
         egos = listed("egos", egos, "Give [0] for the first.")
