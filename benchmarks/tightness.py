@@ -38,7 +38,7 @@ def ranged(
     spread = {"volume": np.ones(d), "street": np.array([*np.ones(d - 1), 0.1]), "line": np.eye(d)[0]}[shape]
     truth = rng.uniform(-20, 20, (vehicles, d)) * spread
     std = gnss_std * np.array([*np.ones(d - 1), stretch])
-    problem = Problem(tuple(f"v{k}" for k in range(vehicles)), dimension=d, separator=() if mesh else (0,))
+    problem = Problem(tuple(f"v{k}" for k in range(vehicles)), dimension=d)
     problem = problem.add("position", list(range(vehicles)), truth + std * rng.standard_normal(truth.shape), std)
     return with_ranges(problem, truth, rng, range_std, star=not mesh)
 

@@ -30,10 +30,10 @@ class Row:
 
 def estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """The ego's newest position (3,) m by least squares, and with a weight for each neighbour's fixes."""
-    fixes = [k for k in range(len(problem.names)) if k not in problem.separator]  # of the others
-    senders = [problem.names[k].split("@")[0] for k in fixes]
-    plain, robust = solve(problem), solve_gnc(problem, [(0, fixes)], groups=senders)
-    return plain.x[problem.separator[-1]], robust.x[problem.separator[-1]]
+    owners, ego = [name.split("@")[0] for name in problem.names], problem.shown
+    fixes = [k for k, owner in enumerate(owners) if owner != owners[ego]]  # of the others
+    plain, robust = solve(problem), solve_gnc(problem, [(0, fixes)], groups=[owners[k] for k in fixes])
+    return plain.x[ego], robust.x[ego]
 
 
 def main(steps: int = 12, runs: int = 3, shares: tuple[float, ...] = (0.0, 0.2, 0.4, 0.6)) -> list[Row]:

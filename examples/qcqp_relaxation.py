@@ -87,7 +87,7 @@ class QCQPRelaxation:
 
 def range_star(star: StarStep, run: int, members: Ints, known: NoiseModel) -> Problem:
     """Fixes of these members and the ego's ranges to them in one run, the ego first; no angles."""
-    problem = Problem(tuple(map(str, range(len(members)))), separator=(0,))
+    problem = Problem(tuple(map(str, range(len(members)))))
     std = np.sqrt(star.variance[run, members])
     problem = problem.add("position", list(range(len(members))), star.position[run, members], std=std)
     if len(members) == 1:

@@ -79,10 +79,10 @@ def test_marginals_are_those_of_gtsams_bayes_tree(crossing_recording, length, ba
     assert solution.covariance == pytest.approx(theirs, abs=1e-6)
 
 
-def chain_of(points: int, separator: tuple[int, ...] = ()) -> Problem:
+def chain_of(points: int) -> Problem:
     """A random walk with some fixes: a linear problem."""
     rng = np.random.default_rng(points)
-    problem = Problem(tuple(f"p{i}" for i in range(points)), separator=separator)
+    problem = Problem(tuple(f"p{i}" for i in range(points)))
     pairs = np.c_[np.arange(points - 1), np.arange(1, points)]
     problem = problem.add("displacement", pairs, rng.normal(size=(points - 1, 3)), std=0.1)
     seen = sorted(rng.choice(points, points // 4, replace=False).tolist())
@@ -92,7 +92,7 @@ def chain_of(points: int, separator: tuple[int, ...] = ()) -> Problem:
 @pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("points", [5, 40, 300])
 def test_a_linear_problem_equals_lstsq(points, backend):
-    """Dense, sparse (300 points without a separator) and osqp's and gtsam's own elimination, against NumPy's lstsq."""
+    """Dense, sparse (300 points) and osqp's and gtsam's own elimination, against NumPy's lstsq."""
     problem = chain_of(points)
     r, J = problem.whiten(np.zeros((points, 3)))
     x = np.linalg.lstsq(J.toarray(), -r)[0].reshape(-1, 3)

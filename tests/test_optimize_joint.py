@@ -32,10 +32,10 @@ def test_a_joint_covariance_is_a_part_of_the_inverse(dimension, steps):
 
 
 def ring() -> Problem:
-    """Points with fixes and distances around a ring, and a window's separator."""
+    """Points with fixes and distances around a ring."""
     rng, names = np.random.default_rng(2), [f"p{k}" for k in range(30)]
     at = np.c_[20 * np.cos(np.arange(30) / 5), 20 * np.sin(np.arange(30) / 5)]
-    problem = Problem(names, x0=at, dimension=2, separator=(0,)).add("position", names, at, std=2.0)
+    problem = Problem(names, x0=at, dimension=2).add("position", names, at, std=2.0)
     pairs = [(0, k) for k in range(1, 30)]
     apart = np.linalg.norm(at[1:] - at[0], axis=1) + 0.1 * rng.normal(size=29)
     return problem.add("range", pairs, apart, std=0.1)

@@ -58,7 +58,7 @@ def test_window_chains_who_stays(recording):
         assert z == pytest.approx(recording.dt * recording.velocity[0, int(t), column])
     stays = sum(name.split("@")[0] + f"@{int(name.split('@')[1]) - 1}" in problem.names for name in problem.names)
     assert len(moved.nodes) == stays
-    assert [problem.names[h] for h in problem.separator] == [f"c0@{s}" for s in range(17, 21)]
+    assert problem.names[problem.shown] == "c0@20"
 
 
 def test_the_noise_model_sets_the_weights(recording):
@@ -126,7 +126,7 @@ BAD = {
     "no factors": (lambda: solve(Problem(("a",))), "no measurements"),
     "words for z": (lambda: PAIR.add("range", ("a", "b"), "far", std=1.0), "array of numbers"),
     "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
-    "separator twice": (lambda: Problem(("a", "b"), separator=(0, 0)), "twice"),
+    "shown": (lambda: Problem(("a", "b"), shown="c"), "node = .c.: must be one of a, b"),
     "x0 not finite": (lambda: Problem(("a",), x0=[[np.nan, 0, 0]]), "x0 = not finite"),
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),

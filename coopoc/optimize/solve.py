@@ -156,7 +156,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         compile_seconds=spent.compile,
         backend=backend.name,
         names=problem.names,
-        shown=problem.separator[-1] if problem.separator else 0,
+        shown=problem.shown,
         unobservable=truth.unobservable,
         space=problem.space,
         violation=truth.violation,

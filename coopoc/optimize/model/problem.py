@@ -71,7 +71,7 @@ class Problem:
         factors: the measurements.
         x0: (n, ambient) where the solver starts. None: the converted measurements' linear solution, or what `solve`
             finds.
-        separator: nodes that the others hang on, such as the ego at each step; a Solution shows the last of them.
+        shown: the node that a Solution prints, such as the ego at the last step.
         dimension: 2 or 3.
         poses: the nodes that have a rotation.
         fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
@@ -90,7 +90,7 @@ class Problem:
     names: tuple[str, ...]
     factors: Sequence[Factor] = ()
     x0: Floats | None = None
-    separator: tuple[int, ...] = ()
+    shown: int = 0
     dimension: int = 3
     poses: tuple[int, ...] = ()
     fixed: tuple[int, ...] = ()
@@ -100,19 +100,16 @@ class Problem:
     __reduce__ = remade
 
     def __post_init__(self) -> None:
-        for field in ("names", "factors", "separator", "poses", "fixed", "constraints"):
+        for field in ("names", "factors", "poses", "fixed", "constraints"):
             if not isinstance(value := getattr(self, field), str | Sequence):
                 self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
         self.__dict__["names"] = tuple(str(name) for name in self.names)
         if len(self._place) != len(self.names):
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
-        for field in ("separator", "poses", "fixed"):
+        for field in ("poses", "fixed"):
             self.__dict__[field] = tuple(self.index(node) for node in getattr(self, field))
-        if len(set(self.separator)) < len(self.separator):
-            raise InputError(
-                "separator", self.separator, "must not name a point twice", "Name each point of the separator once."
-            )
+        self.__dict__["shown"] = self.index(self.shown) if self.names else 0
         self.__dict__["dimension"] = int(Space(self.dimension).dimension)  # 2 or 3
         items: tuple[object, ...] = (*self.factors, *self.constraints)
         for item in items:
@@ -220,7 +217,7 @@ class Problem:
         return changed
 
     def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints]) -> "Problem":
-        """The problem of some nodes, from x, which has no separator.
+        """The problem of some nodes, from x.
 
         Args:
             used: (n,) which nodes.
@@ -234,7 +231,7 @@ class Problem:
         }
         changes["names"] = tuple(compress(self.names, used))
         changes["factors"] = tuple(unchecked(factor, nodes=number[factor.nodes]) for factor in kept)
-        return self.replace_unchecked(**changes, x0=frozen(x[used]), separator=())
+        return self.replace_unchecked(**changes, x0=frozen(x[used]), shown=0)
 
     def rows_among(self, used: Bools) -> list[Ints]:
         """Of each factor, the rows whose nodes are all used (n,)."""
@@ -299,8 +296,8 @@ class Problem:
         A missing fix makes no factor; of a relative measurement its parts make one each where some are missing.
         Arguments and errors as `from_snapshot`; the first step of the window must exist.
         """
-        names, factors, own = window(recording, step, ego, length, run, noise)
-        return cls(names, factors, separator=own)
+        names, factors, newest = window(recording, step, ego, length, run, noise)
+        return cls(names, factors, shown=newest)
 
     def __repr__(self) -> str:
         count: Counter[str] = Counter()

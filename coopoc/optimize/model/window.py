@@ -95,9 +95,9 @@ def relative_std(relative: Floats, sensors: Sensors) -> Floats:
 
 def window(
     recording: Recording, step: int, ego: int | str, length: int, run: int, noise: Noise | None
-) -> tuple[tuple[str, ...], tuple[Factor, ...], tuple[int, ...]]:
+) -> tuple[tuple[str, ...], tuple[Factor, ...], int]:
     """Names of the points of the `length` steps that end at `step`, the ego's first at each, their factors, and which
-    are the ego's.
+    is the ego's newest.
 
     Arguments and errors as `Problem.from_window`.
     """
@@ -128,4 +128,4 @@ def window(
     factors = drive_factors(recording, run, (steps[order], member), link, relative, stds, sensors)
     ids = [recording.ids[m] for m in member]
     names = ids if length == 1 else [f"{name}@{s}" for name, s in zip(ids, steps[order], strict=True)]
-    return tuple(names), factors, tuple(np.flatnonzero(member == column).tolist())
+    return tuple(names), factors, int(np.flatnonzero(member == column)[-1])
