@@ -113,7 +113,7 @@ def short_repr(self: Any) -> str:
 
     >>> from coopoc.evaluate.ledger import of_training
     >>> of_training(["red", "blue"], [10.0, 12.0], [8.0, 8.0])
-    Ledger(names=('red', 'blue'), seconds (2,), sent (2, 2, 1, 2), received (2, 2, 1, 2))
+    Ledger(names=('red', 'blue'), seconds (2,), sent (2, 1, 2), received (2, 1, 2))
     """
     parts = (_part(each.name, getattr(self, each.name)) for each in fields(self) if each.repr)
     return f"{type(self).__name__}({', '.join(filter(None, parts))})"

@@ -193,12 +193,12 @@ def test_the_ledger_counts_every_byte(four):
     fed = trained(four, 3, participation=Participation(0.5), seed=1)
     account, air = ledger(fed), ledger(fed, overhead=100)
     assert (account.names, account.servers) == ((*fed.names, SERVER), (SERVER,))
-    sent, received = (account.of("training", way=way)[0] for way in ("broadcast", "per receiver"))
+    sent, received = (account.of(way=way)[0] for way in ("broadcast", "per receiver"))
     rounds = np.array([sum(name not in row.absent for row in fed.history[1:]) for name in fed.names])
     assert_array_equal(sent, [*rounds * 16, 3 * 12])  # the server broadcasts
     assert_array_equal(received, [*rounds * 12, rounds.sum() * 16])
-    assert_array_equal(air.of("training", "on air", "broadcast")[0] - sent, [*100 * rounds, 300])
-    assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
+    assert_array_equal(air.of("on air", "broadcast")[0] - sent, [*100 * rounds, 300])
+    assert_array_equal(air.of("on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
 
 
 def test_poisoned_updates(four):

@@ -19,12 +19,11 @@ def test_the_ledger_of_a_track_is_its_bytes(crossing):
         track, bare = method(seen, [1, 4]), method(plain, [1, 4])
         account = of_track(track, seen, method.message)
         assert account.names == ("c1", "c4")
-        assert_array_equal(account.of("online", "on air"), track.received_bytes)
-        assert_array_equal(account.of("online", "on air", "broadcast"), track.sent_bytes)
-        assert_allclose(account.of("online"), bare.received_bytes, rtol=1e-12)
-        assert_allclose(account.of("online", way="broadcast"), bare.sent_bytes, rtol=1e-12)
+        assert_array_equal(account.of("on air"), track.received_bytes)
+        assert_array_equal(account.of("on air", "broadcast"), track.sent_bytes)
+        assert_allclose(account.of(), bare.received_bytes, rtol=1e-12)
+        assert_allclose(account.of(way="broadcast"), bare.sent_bytes, rtol=1e-12)
         assert account.rate("on air") == pytest.approx(track.received_bytes.mean() / 6.0)
-        assert account.per_vehicle("training") == 0.0
     alone = of_track(Kalman()(seen, [1]), seen, NO_MESSAGE)
     assert alone.rate() == alone.rate("on air", "broadcast") == 0.0
 
@@ -34,21 +33,21 @@ def test_the_papers_training_costs_as_much_as_an_hour_of_driving():
     stream of 0.9 kB/s, or 15 min of 350 B at 10 Hz."""
     weights = 20 * 4 * 19_938.0
     once = of_training(["a", "b", "server"], [weights] * 3, [weights, weights, 2 * weights], ["server"])
-    assert once.per_vehicle("training") == pytest.approx(3.19e6, rel=1e-3)
-    assert once.per_vehicle("training", way="broadcast") == 1.5 * weights
+    assert once.per_vehicle() == pytest.approx(3.19e6, rel=1e-3)
+    assert once.per_vehicle(way="broadcast") == 1.5 * weights
     for rate, minutes in ((900.0, 59.1), (3500.0, 15.2)):
-        moved = np.multiply.outer([0.0, 2 * rate], np.ones((2, 1, 1)))
+        moved = np.full((2, 1, 1), 2 * rate)
         drive = Ledger(("a",), np.full(1, 2.0), moved, moved)
-        assert once.per_vehicle("training") / drive.rate() / 60 == pytest.approx(minutes, abs=0.05)
+        assert once.per_vehicle() / drive.rate() / 60 == pytest.approx(minutes, abs=0.05)
     with refused("seconds"):
         once.rate()
 
 
 def test_a_ledger_refuses_what_does_not_fit():
-    none = np.zeros((2, 2, 1, 1))
+    none = np.zeros((2, 1, 1))
     with refused("seconds"):
         Ledger(("a",), np.zeros(2), none, none)
     with refused("names"):
         Ledger(("a",), np.zeros(1), none, none, servers=("server",))
     with refused("kind"):
-        of_training(["a"], [1.0], [1.0]).of("training", "wire")  # type: ignore[arg-type]
+        of_training(["a"], [1.0], [1.0]).of("wire")  # type: ignore[arg-type]

@@ -176,7 +176,7 @@ TOWN = replace(TOWN, heading=true_heading(TOWN))
 SEEN = co.observe(TOWN, SENSORS, CHANNEL, runs=2)
 BODY = co.observe(TOWN, replace(SENSORS, heading_std=0.05), CHANNEL, runs=2, frame="body")
 OWN, POSES = co.Kalman()(SEEN, [0, 1]), co.PoseFilter("solo")(BODY, [0])
-BYTES = co.Ledger(("a",), [9.0], np.ones((2, 2, 1, 1)), np.ones((2, 2, 1, 1)))
+BYTES = co.Ledger(("a",), [9.0], np.ones((2, 1, 1)), np.ones((2, 1, 1)))
 NOISE = replace(SENSORS, **dict.fromkeys(ANGULAR, 0.07))
 
 

@@ -1,5 +1,4 @@
-"""Ledger: the bytes of training and of online cooperation on one axis, as payload and on air, sent once or per
-receiver."""
+"""Ledger: the bytes of a training or of online cooperation, as payload and on air, sent once or per receiver."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from ..text import short_repr
 from ..world.recording import Recording
 from ..world.v2x import Message
 
-Purpose = Literal["training", "online"]
 Kind = Literal["payload", "on air"]
 Way = Literal["broadcast", "per receiver"]
 """Bytes sent, each message once; or bytes received, one copy for each receiver, as unicast would carry it."""
@@ -23,21 +21,21 @@ Way = Literal["broadcast", "per receiver"]
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Bytes of V participants in R runs, by purpose ("training", "online") and kind ("payload", "on air").
+    """Bytes of V participants in R runs, by kind ("payload", "on air").
 
     Args:
         names: (V,) of the participants.
-        seconds: (V,) of driving that the online bytes are for; 0 for participants that only train, and for servers.
-        sent: (2, 2, R, V) bytes, purposes x kinds: a message once, whatever the number of its receivers.
-        received: (2, 2, R, V) bytes: a message in the account of each receiver.
+        seconds: (V,) of driving that the bytes are for; 0 for a training, and for servers.
+        sent: (2, R, V) bytes, by kind: a message once, whatever the number of its receivers.
+        received: (2, R, V) bytes: a message in the account of each receiver.
         servers: the participants that are no vehicles.
 
     Raises:
         InputError: shapes that do not fit together, a name twice, a server that does not take part.
 
     >>> once = of_training(["a", "b"], [400.0, 400.0], [200.0, 200.0])
-    >>> once.per_vehicle("training"), once
-    (200.0, Ledger(names=('a', 'b'), seconds (2,), sent (2, 2, 1, 2), received (2, 2, 1, 2)))
+    >>> once.per_vehicle(), once
+    (200.0, Ledger(names=('a', 'b'), seconds (2,), sent (2, 1, 2), received (2, 1, 2)))
     """
 
     names: tuple[str, ...]
@@ -52,7 +50,7 @@ class Ledger:
     def __post_init__(self) -> None:
         for name in ("names", "servers"):
             self.__dict__[name] = texts(name, getattr(self, name))
-        moved = "(2, 2, R, V)", (2, 2, -1, len(self.names))
+        moved = "(2, R, V)", (2, -1, len(self.names))
         check_arrays(self, {"seconds": ("(V,)", (len(self.names),)), "sent": moved, "received": moved})
         for name in ("seconds", "sent", "received"):
             values = getattr(self, name)
@@ -63,24 +61,23 @@ class Ledger:
         if len(set(self.names)) < len(self.names) or not set(self.servers) <= set(self.names):
             raise InputError("names", self.names, f"must differ and hold the servers {self.servers}", "Rename them.")
 
-    def of(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> Floats:
+    def of(self, kind: Kind = "payload", way: Way = "per receiver") -> Floats:
         """(R, V) bytes."""
         one_of("way", way, Way)
-        one_of("purpose", purpose, Purpose)
         one_of("kind", kind, Kind)
         array = self.sent if way == "broadcast" else self.received
-        return np.asarray(array[get_args(Purpose).index(purpose), get_args(Kind).index(kind)])
+        return np.asarray(array[get_args(Kind).index(kind)])
 
-    def per_vehicle(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> float:
+    def per_vehicle(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
         """Bytes of all, servers included, for each vehicle: the mean over runs."""
         vehicles = len(self.names) - len(self.servers)
-        return float(self.of(purpose, kind, way).sum(axis=1).mean()) / max(vehicles, 1)
+        return float(self.of(kind, way).sum(axis=1).mean()) / max(vehicles, 1)
 
     def rate(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
-        """Online bytes per second of driving and vehicle; InputError without any driving."""
+        """Bytes per second of driving and vehicle; InputError without any driving."""
         if not self.seconds.sum() > 0:
             raise InputError("seconds", self.seconds.tolist(), "must be > 0 for some vehicle", "Add a drive.")
-        return float(self.of("online", kind, way).sum(axis=1).mean() / self.seconds.sum())
+        return float(self.of(kind, way).sum(axis=1).mean() / self.seconds.sum())
 
 
 def of_training(
@@ -102,14 +99,13 @@ def of_training(
         overhead: bytes per message on air.
 
     >>> ledger = of_training(["a", "s"], [80.0, 40.0], [40.0, 80.0], ["s"], messages=np.ones((2, 2)), overhead=10)
-    >>> ledger.per_vehicle("training"), ledger.per_vehicle("training", "on air")
+    >>> ledger.per_vehicle(), ledger.per_vehicle("on air")
     (120.0, 140.0)
     """
     overhead = number("overhead", overhead, 0, 10**9, kind=int, allowed=">= 0 bytes")
     count = (len(names),)
     payload = np.array([checked("sent", sent, "(V,)", count), checked("received", received, "(V,)", count)])
-    kinds = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]
-    moved = np.stack([kinds, np.zeros_like(kinds)], axis=1)
+    moved = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]
     return Ledger(tuple(names), np.zeros(len(names)), moved[0], moved[1], tuple(servers))
 
 
@@ -135,11 +131,11 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     """
     of_recording(track, recording)
     overhead, vehicles = recording.v2x.overhead, len(track.egos)
-    size, moved = message.size(overhead), np.zeros((2, 2, 2, len(track.received_bytes), vehicles))
+    size, moved = message.size(overhead), np.zeros((2, 2, len(track.received_bytes), vehicles))
     for k, on_air in enumerate((track.sent_bytes, track.received_bytes)):
         payload = on_air * (message.size() / size if size else 1.0)
         if message.per_neighbour:
             payload = on_air - overhead * np.isfinite(recording.velocity[0, :, track.egos, 0]).sum(axis=1)
-        moved[k, 1] = payload, on_air
+        moved[k] = payload, on_air
     steps = np.full(vehicles, len(track.t)) if track.absent is None else (~track.absent).sum(axis=0)
     return Ledger(tuple(recording.ids[ego] for ego in track.egos), steps * recording.dt, *moved)

@@ -119,7 +119,7 @@ def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
 def online_columns(track: Track, recording: Recording, method: Method) -> dict[str, AnyArray]:
     """Bytes per second of a track, and whether it ever left the fixes, which need no truth."""
     account = of_track(track, recording, method.message)
-    rates = {name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()}
+    rates = {name: account.of(*counted) / account.seconds for name, counted in BYTES.items()}
     return {**rates, "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float)}
 
 

@@ -35,7 +35,7 @@ for name, noise in (("training", training), ("scenario 2", sensors)):
 group = clients(drives, training, seed=0)
 fed = federate(GainNet(), group, rounds=20, seed=0)
 local = [fit(GainNet(), one.training, one.validation, seed=0, long=one.long).model for one in group]
-once = ledger(fed).per_vehicle("training")
+once = ledger(fed).per_vehicle()
 print(f"{once / 1e6:.1f} MB per vehicle for the federation; 0 MB alone")
 
 # %% [markdown]
