@@ -231,25 +231,6 @@ def test_a_stream_is_that_of_its_key(seed, run):
     assert stream(seed, "gnss", run, "a", "b").normal() == wanted.normal()
 
 
-def test_what_one_recording_drew_another_shares_and_nobody_keeps(crossing):
-    import gc
-
-    from coopoc.world import sensing
-
-    alone = observe(crossing, Sensors(), V2X(max_neighbours=2), runs=2)
-    apart = alone.relative.copy()
-    del alone
-    gc.collect()
-    assert not [key for key in sensing._alive if key[1] is crossing]
-    wide = observe(crossing, Sensors(), V2X(max_neighbours=5), runs=2)
-    few = observe(crossing, Sensors(), V2X(max_neighbours=2), runs=2)
-    assert few.gnss is wide.gnss
-    assert few.velocity is wide.velocity
-    assert np.array_equal(few.relative, apart)
-    other = observe(crossing, Sensors(), V2X(max_neighbours=2), runs=2, seed=1)
-    assert not np.array_equal(other.gnss, wide.gnss)
-
-
 def test_a_message_is_held_until_it_is_too_old():
     """By the definition, link by link: the newest message of the sender that has arrived, unless older than max_age."""
     fleet = standing([[0, 0, 0], [9, 0, 0], [0, 9, 0]], 40)

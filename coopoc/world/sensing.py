@@ -1,12 +1,11 @@
 """observe: a Fleet seen through Sensors and a V2X channel becomes a Recording."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
-from weakref import WeakValueDictionary
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, instance, one_of, runs_in_memory, seed_of
+from ..arrays import Bools, Floats, Ints, instance, one_of, runs_in_memory, seed_of
 from ..errors import InputError
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
@@ -18,8 +17,6 @@ from .sensors import Sensors, stream
 from .v2x import V2X
 
 Frame = Literal["world", "body"]
-_alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()
-"""Draws of recordings that still exist, by all that they depend on: the next channel need not draw them again."""
 
 
 def observe(
@@ -78,23 +75,19 @@ def observe(
     arrival[:, np.isin(links.neighbour, standing)] = -1
     broadcasts[:, standing] = False
     instance("remove_outliers", remove_outliers, bool, "Give True to remove outliers.")
-    drawn, key = (fleet, sensors, runs, seed, remove_outliers), (fleet, repr(sensors), runs, seed, remove_outliers)
-    gnss = _once(("gnss", *key), lambda: _gnss(*drawn))
-    if standing:
-        gnss = gnss.copy()
-        gnss[:, :, standing] = fleet.position[:, standing]
-    who = (watching, tuple(standing), v2x.radius, v2x.max_neighbours)
-    relative = _once(
-        ("relative", *key, who), lambda: _relative_measurements(fleet, links, sensors, v2x, runs, seed, remove_outliers)
-    )
+    gnss = _gnss(fleet, sensors, runs, seed, remove_outliers)
+    gnss[:, :, standing] = fleet.position[:, standing]
+    relative = _relative_measurements(fleet, links, sensors, v2x, runs, seed, remove_outliers)
     body = None
     if frame == "world":
-        velocity = _once(("velocity", *key), lambda: _velocity(*drawn))
+        velocity = _velocity(fleet, sensors, runs, seed, remove_outliers)
     else:
         velocity, body = body_measurements(fleet, sensors, runs, seed)
         if sensors.outliers:
             wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, remove_outliers)
         relative = in_body(relative, fleet, links, _own_errors(fleet, links, sensors, runs, seed, *HEADING))
+    for array in (gnss, velocity, relative):
+        array.flags.writeable = False  # so that the Recording need not copy them
     wrong = sensors.outliers.notes if sensors.outliers else ()
     notes = tuple(f"{note}{', removed' * remove_outliers}" for note in wrong)
     return Recording(
@@ -174,16 +167,6 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
     observers, everyone = (KDTree(each, 32, False, balanced_tree=False) for each in (tagged[looks], tagged))
     pairs = observers.sparse_distance_matrix(everyone, reach, output_type="ndarray")
     return here[looks][pairs["i"]], here[pairs["j"]]
-
-
-def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:
-    """The draws of a key, shared while a recording holds them, else drawn now; read-only."""
-    value = _alive.get(key)
-    if value is None:
-        value = draw()
-        value.flags.writeable = False
-        _alive[key] = value
-    return value
 
 
 def _noisy(fleet: Fleet, sensor: str, runs: int, seed: int, mean: Floats, std: Floats) -> Floats:
