@@ -163,7 +163,7 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     missing the filter predicts, and the innovation is NaN."""
     process, ratio, gnss_std = stds.unsqueeze(2).unbind(1)
     noise, x = gnss_std.square(), batch.x0
-    variance = noise if batch.exact is None else noise * (~batch.exact)[..., None]
+    variance = noise * (not batch.exact)
     estimates, normalised = [], []
     paces = own_variances(OF_PACE, batch.velocity.transpose(0, 1).double().numpy(), batch.dt)
     motions = process.square() + ratio.square() * torch.from_numpy(paces).transpose(0, 1).to(ratio)

@@ -1,9 +1,9 @@
 """Clients: the training drives, each with its own noise, cut into private segments."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -21,14 +21,14 @@ LONG_PIECES = 9
 
 class Batch(NamedTuple):
     """Input of S models, B segments each: gnss, NaN where a fix is missing, velocity, truth, NaN where there is none
-    and no loss counts (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is the truth (S, B), None if it never is."""
+    and no loss counts (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is the truth."""
 
     gnss: Tensor
     velocity: Tensor
     truth: Tensor
     x0: Tensor
     dt: float
-    exact: Tensor | None = None
+    exact: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +39,14 @@ class Segments:
         gnss: (n, T + 1, 3) m; sample 0 only starts the filter.
         velocity: (n, T + 1, 3) m/s.
         truth: (n, T + 1, 3) m.
-        true_start: (n,) whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
+        true_start: whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
         dt: s.
     """
 
     gnss: Tensor
     velocity: Tensor
     truth: Tensor
-    true_start: Tensor
+    true_start: bool
     dt: float
 
     __repr__ = short_repr
@@ -54,15 +54,10 @@ class Segments:
     def __post_init__(self) -> None:
         check_fields(self, {"dt": (1e-9, 1e9, "> 0 s")})
         shape = tuple(self.truth.shape)
-        for name, wanted in {
-            "gnss": shape,
-            "velocity": shape,
-            "truth": (*shape[:2], 3),
-            "true_start": shape[:1],
-        }.items():
+        for name, wanted in {"gnss": shape, "velocity": shape, "truth": (*shape[:2], 3)}.items():
             actual = tuple(getattr(self, name).shape)
             if actual != wanted:
-                allowed = "must be a tensor (n, T + 1, 3) as the others are, true_start (n,)"
+                allowed = "must be a tensor (n, T + 1, 3) as the others are"
                 raise InputError(name, f"shape {actual}", allowed, "Make segments with learned.clients(...).")
 
     def __len__(self) -> int:
@@ -71,10 +66,8 @@ class Segments:
     def batch(self, index: Tensor) -> Batch:
         """Segments `index` (S, B)."""
         drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
-        exact = self.true_start[index]
-        x0 = torch.where(exact[..., None], drives[2, 0], drives[0, 0])
         gnss, velocity, truth = drives[:, 1:].unbind()
-        return Batch(gnss, velocity, truth, x0, self.dt, exact if exact.any() else None)
+        return Batch(gnss, velocity, truth, drives[2 * self.true_start, 0], self.dt, self.true_start)
 
     @cached_property
     def _drives(self) -> AnyArray:
@@ -87,16 +80,18 @@ class Segments:
 
     @classmethod
     def join(cls, parts: "Sequence[Segments]") -> "Segments":
-        """All pieces of several parts in their order; the parts agree in length and dt."""
-        if len({(p.truth.shape[1], p.dt) for p in parts}) != 1:
-            agreed = [(p.truth.shape[1], p.dt) for p in parts]
-            raise InputError("pieces", agreed, "must agree in length and dt", "Cut all clients alike.")
+        """All pieces of several parts in their order; the parts agree in length, dt and start."""
+        agreed = {(p.truth.shape[1], p.dt, p.true_start) for p in parts}
+        if len(agreed) != 1:
+            raise InputError("pieces", agreed, "must agree in length, dt and start", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
     def _each(self, made: Callable[[str], Tensor]) -> "Segments":
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
-        tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
-        return Segments(**tensors, dt=self.dt)
+        tensors: dict[str, Any] = {
+            f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)
+        }
+        return replace(self, **tensors)
 
 
 def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
@@ -210,4 +205,4 @@ def _cut(drive: Sequence[Floats], piece: int, dt: float, start: Start) -> Segmen
     origin = truth[begun, :1]
     parts = (gnss[begun] - origin, velocity[begun], truth[begun] - origin)
     fixes, speeds, truths = (torch.tensor(part, dtype=torch.float32) for part in parts)
-    return Segments(fixes, speeds, truths, torch.full((begun.sum(),), start == "true"), dt)
+    return Segments(fixes, speeds, truths, start == "true", dt)

@@ -113,6 +113,6 @@ def _segments(drives: MeasuredDrives, column: int, cuts: Sequence[Cut], piece: i
         gnss=tensor(recording.gnss, origin),
         velocity=tensor(recording.velocity),
         truth=tensor(target, origin),
-        true_start=torch.full((len(cuts),), start == "true"),
+        true_start=start == "true",
         dt=recording.dt,
     )
