@@ -18,7 +18,6 @@ from coopoc.data.log.residuals import begin_of, together
 from coopoc.data.mrclam import calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
-from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.study.study import Params
 from coopoc.world.storage import digest
 
@@ -48,14 +47,14 @@ class Drive:
         begin: first poses (1, N, 4) m and rad, None where first fixes and compasses give them.
         truth: on the steps of the recording, None if there is none.
         lasting: whether scale and bias of the odometry, and the offset of ranges, are states.
-        spread: m, m, m and rad of the first poses.
+        spread: m, m, m and rad of the first poses; None as of PoseFilter.
     """
 
     recording: Recording
     begin: Floats | None
     truth: Fleet | None
     lasting: bool
-    spread: tuple[float, ...] = SPREAD
+    spread: tuple[float, ...] | None = None
 
     @property
     def ids(self) -> tuple[str, ...]:

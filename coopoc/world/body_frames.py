@@ -61,8 +61,9 @@ def midway(heading: Floats) -> Floats:
 def body_motion(fleet: Fleet) -> tuple[Floats, Floats]:
     """True velocity (T, N, 3) m/s, forward, left and up, and yaw rate (T, N) rad/s over the step that ends at t."""
     heading = true_heading(fleet)
-    change = np.diff(heading, axis=0, prepend=heading[:1])
-    rate = np.where(fleet.present, np.nan_to_num(change) / fleet.dt, np.nan)
+    change = np.nan_to_num(np.diff(heading, axis=0, prepend=heading[:1]))
+    turns = np.round(change / (2 * np.pi))  # between headings that are wrapped
+    rate = np.where(fleet.present, (change - 2 * np.pi * turns) / fleet.dt, np.nan)
     return turned(fleet.velocity, -midway(heading)), rate
 
 

@@ -11,7 +11,6 @@ import scipy  # its statistics take half a second, and are imported where they a
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
-from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.world.body_frames import in_world
 from coopoc.world.links import spherical, stretches, wrap
 
@@ -107,9 +106,9 @@ def together(log: Log) -> tuple[Log, str]:
     return replace(log, recording=rec.between(first, last), truth=truth), span
 
 
-def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...], str]:
+def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:
     """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; their
-    standard deviations; and which, where it is the last.
+    standard deviations, None as the filter states them; and which, where it is the last.
 
     Args:
         log: in body frames, all vehicles there at its first step.
@@ -120,9 +119,9 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...], str]:
     rec, truth, moving = log.recording, log.truth, _moving(log.recording)
     assert rec.body is not None
     if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
-        return None, SPREAD, ""
+        return None, None, ""
     try:
-        return pose_start(rec, gate=GATE_STDS), SPREAD, ""
+        return pose_start(rec, gate=GATE_STDS), None, ""
     except InputError:
         if truth is None or truth.heading is None:
             raise

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
-from .odometry import PoseNoise, join, predict
+from .odometry import PoseNoise, join, predict, symmetrise
 from .scalar_update import (
     ALONE,
     COST,
@@ -235,3 +235,4 @@ def set_member(poses: Poses, member: int, source: Poses, at: int, d: int, weight
         poses.x[member + i] = source.x[at + i]
         for j in range(d):
             poses.cov[member + i, member + j] = source.cov[at + i, at + j] / weight
+    symmetrise(poses.cov, member, d)

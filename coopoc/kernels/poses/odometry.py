@@ -75,6 +75,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
         x[i] *= noise.keep
     move_rows(cov, member, d, (east, north, up), scale, dt, noise.keep)
     move_rows(cov.T, member, d, (east, north, up), scale, dt, noise.keep)
+    symmetrise(cov, member, d)
     cov[member, member] += cos * cos * q[0] + sin * sin * q[1]
     cov[member + 1, member + 1] += sin * sin * q[0] + cos * cos * q[1]
     cov[member, member + 1] += cos * sin * (q[0] - q[1])
@@ -114,6 +115,15 @@ def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: 
             cov[member + HEADING, j] += db
             cov[member + 4, j] *= keep
             cov[member + 5, j] *= keep
+
+
+@part
+def symmetrise(cov: Floats, member: int, d: int) -> None:
+    """The mean of P and P^T in the rows and columns of a member: updates leave the difference, which rounding makes, as
+    it is, however small they make P, and fusion magnifies it."""
+    for i in range(member, member + d):
+        for j in range(len(cov)):
+            cov[i, j] = cov[j, i] = 0.5 * (cov[i, j] + cov[j, i])
 
 
 @part

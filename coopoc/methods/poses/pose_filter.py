@@ -68,7 +68,7 @@ class PoseFilter:
             (`coopoc.kernels.gate`); False believes every number.
         gate: standard deviations of an innovation.
         begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
-        spread: (4,) standard deviations of these.
+        spread: (4,) standard deviations of these; None: SPREAD, of a position at least that of a fix if there is one.
         assumed: noise, default that of the recording.
 
     References:
@@ -91,7 +91,7 @@ class PoseFilter:
     robust: bool = True
     gate: float = 3.0
     begin: Floats | None = None
-    spread: tuple[float, ...] = SPREAD
+    spread: tuple[float, ...] | None = None
     assumed: Sensors | None = None
     name: str = ""
 
@@ -102,7 +102,7 @@ class PoseFilter:
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
-        if not (checked("spread", self.spread, "(4,)", (4,)) > 0).all():
+        if not (checked("spread", self.spread or SPREAD, "(4,)", (4,)) > 0).all():
             raise InputError("spread", self.spread, "must be > 0", "Give m, m, m and rad.")
         if not self.name:
             self.__dict__["name"] = f"pose-{self.unit if self.fusion == 'joint' else self.fusion}"
@@ -217,7 +217,7 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         radians("headings of begin", first[3:])
-        return PoseStream(*self.settings(self.assumed, dt), first, np.array(self.spread, dtype=float), dt)
+        return PoseStream(*self.settings(self.assumed, dt), first, np.array(self.spread or SPREAD, dtype=float), dt)
 
     def run_filter(
         self,
@@ -241,11 +241,13 @@ class PoseFilter:
         from ...kernels.poses.ekf import run_filter
         from ...kernels.poses.scalar_update import new_poses
 
-        noise, options = self.settings(self.assumed or recording.sensors, recording.dt)
+        sensors, spread = self.assumed or recording.sensors, np.array(self.spread or SPREAD, dtype=float)
+        if self.spread is None and np.isfinite(recording.gnss[:, :, members]).any():
+            spread[:3] = np.maximum(spread[:3], sensors.fix_std)
+        noise, options = self.settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
-        first, spread = begin.reshape(len(begin), -1, *begin.shape[-2:]), np.array(self.spread, dtype=float)
-        first = np.ascontiguousarray(first[:, :, members])
+        first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         return run_filter(measured, noise, first, spread, options, *memory)
 
     def settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
