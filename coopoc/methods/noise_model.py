@@ -254,7 +254,8 @@ def resolve(noise_model: NoiseModel | str, recording: Recording | None, relative
 
 
 def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> NoiseModel:
-    """The model with a floor for the range's std where the direction of a range is uncertain; a note reports it.
+    """The model with a floor for the range's std where the direction of a range is uncertain, by medians of the whole
+    drive; a note reports it.
 
     A direction that is off by e shortens d to d cos e along the assumed one: by d e^2 / 2, whose standard deviation is
     d std^2 / sqrt(2). Of measured angles std is theirs; where there are none, that of the line between two fixes,
@@ -294,7 +295,8 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
         return noise_model
     std = float(np.hypot(arc, noise.range_std))
     text = (
-        f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why} put what is {far:.3g} m away on an arc"
+        f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m, by the whole drive (not causal): "
+        f"{why} put what is {far:.3g} m away on an arc"
     )
     return replace(noise_model, sensors=replace(noise, range_std=std), notes=(*notes, text))
 
