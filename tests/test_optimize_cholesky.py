@@ -78,7 +78,7 @@ def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():
 
 def test_small_matrices_are_factored_by_one_thread(monkeypatch):
     """Of two cores that share 150 rows each waits for the other, a hundred times as long as one alone takes."""
-    cholesky, threads, whole = Cholesky(np.arange(151), np.arange(150)), set[int](), multifrontal.factorise
+    threads, whole = set[int](), multifrontal.factorise
 
     def counted(*arguments):
         threads.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
@@ -86,7 +86,7 @@ def test_small_matrices_are_factored_by_one_thread(monkeypatch):
 
     monkeypatch.setattr(multifrontal, "factorise", counted)
     with threadpool_limits(2):
-        assert cholesky.factor(np.ones(150))
+        assert Cholesky(np.arange(151), np.arange(150)).factor(np.ones(150))
     assert threads == {1}
 
 

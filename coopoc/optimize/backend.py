@@ -100,8 +100,9 @@ class Backend:
                 hint = suggestion(name, allowed, "Leave it out.")
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
         most, tolerance = options.get("max_iterations", MAX_ITERATIONS), options.get("tolerance", SOLVER_STEP_TOLERANCE)
-        number("max_iterations", most, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
-        number("tolerance", tolerance, TINY, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
+        if options:
+            number("max_iterations", most, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
+            number("tolerance", tolerance, TINY, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"

@@ -118,14 +118,16 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
     constraints, searching = problem.constraints, problem.x0 is None and not whole
-    problem = problem.replace_unchecked(constraints=())  # which the search for a start leaves to the solver
+    if constraints:  # which the search for a start leaves to the solver
+        problem = problem.replace_unchecked(constraints=())
     if searching:
         problem = _searched(problem, start)
     built, searched = clock(), problem.search.seconds
     if any(f.loss is not None and (not f.loss.convex or problem.x0 is None) for f in problem.factors):
         problem = robust_start(problem, start if problem.x0 is None else problem.x0)
     start = start if problem.x0 is None else problem.x0
-    problem = problem.replace_unchecked(constraints=constraints)
+    if constraints:
+        problem = problem.replace_unchecked(constraints=constraints)
     result = backend.run(problem, start, options)
     if searching and constraints:
         problem, result = _drawn(problem, backend, options, result)
@@ -226,9 +228,11 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
     if problem.linear and not problem.constraints:
         return somewhere(problem), True
     start, placed = guessed(problem)
-    if problem.x0 is None:
+    lost = undirected(problem, start)
+    if lost and problem.x0 is None:
         start = directed(problem, start)
-    for item, nodes in undirected(problem, start):
+        lost = undirected(problem, start)
+    for item, nodes in lost:
         pair = " and ".join(problem.names[n] for n in nodes[0])
         if item.measurement.compares_poses:
             what, hint = f"{pair} half a turn from what is measured", "Give an x0 that is turned less."

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
 from threading import local
 from time import perf_counter
@@ -38,6 +39,7 @@ def waiting(kind: str) -> Iterator[None]:
         setattr(spent, kind, getattr(spent, kind) + clock() - began)
 
 
+@cache
 def load(*modules: str) -> None:
     """Import modules by name now, so that no computation waits for them."""
     with waiting("load"):

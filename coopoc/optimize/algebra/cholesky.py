@@ -32,8 +32,11 @@ class Cholesky:
     """
 
     def __init__(self, indptr: Ints, indices: Ints, group: Ints | None = None) -> None:
-        from ...kernels.graphs.multifrontal import places
+        from ...kernels.graphs.multifrontal import factorise, places, selected_inverse, solved
 
+        # to import them again at each call takes as long as to factor a star
+        self._factorise, self._solved = factorise, solved
+        self._places, self._selected_inverse = places, selected_inverse
         size = len(indptr) - 1
         self._fronts = analysed(indptr, indices, np.arange(size) if group is None else group)
         self._rank = np.argsort(self._fronts.order)
@@ -43,34 +46,26 @@ class Cholesky:
 
     def factor(self, values: Floats) -> bool:
         """Factor an upper triangle's values; whether it is positive definite."""
-        from ...kernels.graphs.multifrontal import factorise
-
         with _unshared(len(self._rank)):
-            return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
+            return not len(values) or bool(self._factorise(self._fronts, self._place, values, self._factor))
 
     @property
     def pivots(self) -> Floats:
         """(u,) squares of L's diagonal."""
-        from ...kernels.graphs.multifrontal import places
-
-        return np.square(self._factor[places(self._fronts, self._rank, self._rank)])
+        return np.square(self._factor[self._places(self._fronts, self._rank, self._rank)])
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        from ...kernels.graphs.multifrontal import solved
-
-        return solved(self._fronts, self._factor, rhs)
+        return self._solved(self._fronts, self._factor, rhs)
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
         """A^-1 at pairs of unknowns (K,), each of which A has an entry for.
 
         See `selected_inverse`; time and memory are those of the factor, not of the inverse.
         """
-        from ...kernels.graphs.multifrontal import places, selected_inverse
-
         with _unshared(len(self._rank)):
-            inverse = selected_inverse(self._fronts, self._factor)
-        return inverse[places(self._fronts, self._rank[rows], self._rank[columns])]
+            inverse = self._selected_inverse(self._fronts, self._factor)
+        return inverse[self._places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
 def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:

@@ -50,6 +50,11 @@ class Entries:
         """(m,) places of the diagonal."""
         return self.indptr[1:] - 1
 
+    @cached_property
+    def marginals(self) -> tuple[Bools, Ints, Ints]:
+        """The `pairs_of` the directions of each node."""
+        return pairs_of(self.number)
+
     def places(self, first: Ints, last: Ints, row: Ints, column: Ints) -> Ints:
         """(K, M) where products of directions (K,) of pairs of nodes (M,) belong, -1 if nowhere."""
         upper, lower = np.maximum(first, last), np.minimum(first, last)
@@ -119,7 +124,9 @@ class Layout:
     """
 
     def __init__(self, structure: Structure) -> None:
-        self.terms = structure.factors
+        from ...kernels.graphs.graph_tape import accumulate
+
+        self.terms, self._accumulate = structure.factors, accumulate
         self.entries: Entries = entries_of(structure.movable, [term.nodes for term in self.terms])
         self._local = threading.local()
         self._tapes: dict[Model, list[tuple[Any, Ints, Ints]]] = {}
@@ -140,14 +147,12 @@ class Layout:
             x: (n, ambient).
             numbers: of each factor, see `numbers_of`.
         """
-        from ...kernels.graphs.graph_tape import accumulate
-
         if model not in self._tapes:
             written = [(write(term.kind, model), term.nodes) for term in self.terms]
             self._tapes[model] = [(w.tape, nodes, places_of(self.entries, nodes, w.entries)) for w, nodes in written]
         out = np.zeros(2 if model == "cost" else self.entries.size + len(self.entries.indices) + 2)
         for (tape, nodes, goal), own in zip(self._tapes[model], numbers, strict=True):
-            accumulate(tape, x, nodes, own, goal, out)
+            self._accumulate(tape, x, nodes, own, goal, out)
         return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
-from ..algebra.sparse import Entries, Sparse, pairs_of, shared_layout, sparse, structure_of
+from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, unchecked
 from ..model.problem import Problem, several
@@ -156,7 +156,7 @@ def _largest(problem: Problem, entries: Entries, numbers: Floats) -> Floats:
 def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]:
     """Marginals (n, dof, dof) under the noise that is stated, and their diagonal (m,); the cost's factor is at hand."""
     system, stated = sparse(problem), as_stated(problem)
-    free, rows, columns = pairs_of(system.entries.number)
+    free, rows, columns = system.entries.marginals
     blocks, cov = np.full(len(rows), np.nan), np.zeros(free.shape)
     if stated is problem or system.cholesky.factor(sparse(stated).quadratic(x, model)[2]):
         blocks = system.cholesky.inverse(rows, columns)

@@ -98,9 +98,12 @@ class Structure(NamedTuple):
 def numbers_of(factor: Factor) -> Floats:
     """(P, M) z, constants and weights of the measurements of a factor."""
     weight = np.asarray(factor.sqrt_information) if factor.std is None else 1.0 / factor.std
-    weight = weight.reshape(len(weight), -1)
-    weight = np.broadcast_to(weight, (len(factor.nodes), weight.shape[1]))
-    return np.hstack([factor.z, np.asarray(factor.constants), weight]).T.copy()
+    parts = factor.z, np.asarray(factor.constants), weight.reshape(len(weight), -1)
+    numbers, end = np.empty((sum(part.shape[1] for part in parts), len(factor.nodes))), 0
+    for part in parts:
+        begin, end = end, end + part.shape[1]
+        numbers[begin:end] = part.T
+    return numbers
 
 
 def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:

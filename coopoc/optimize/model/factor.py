@@ -152,14 +152,15 @@ class Factor:
         """(M,) True where the measurement carries information."""
         return np.asarray((self.root != 0).any(axis=(1, 2)))
 
-    @property
+    @cached_property
     def measured(self) -> Ints:
         """(M,) numbers that carry information: the rank of W."""
         if self.std is not None:
             return np.broadcast_to(np.isfinite(self.std).sum(axis=1), len(self.nodes))
         root, rank = self.root, np.full(len(self.nodes), self.size)
         flat = ~(np.abs(np.linalg.det(root)) > DEPENDENT_VOLUME * np.linalg.norm(root, axis=2).prod(axis=1))
-        rank[flat] = np.linalg.matrix_rank(root[flat])  # which takes as long as many steps of a solve
+        if flat.any():  # the rank takes as long as many steps of a solve
+            rank[flat] = np.linalg.matrix_rank(root[flat])
         return rank
 
     @property
