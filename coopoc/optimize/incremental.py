@@ -227,24 +227,16 @@ class Incremental:
         return replace(solution, extras=solution.extras | {"isam2_off": float(off)})
 
 
-def incremental(
-    problem: Problem,
-    relinearizeThreshold: float = 0.1,
-    relinearizeSkip: int = 10,
-    wildfireThreshold: float = 1e-3,
-    lag: int = 0,
-) -> Incremental:
+def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Incremental:
     """A problem that grows live: GTSAM's iSAM2 takes a step with all that is added.
 
     Robust losses are those of `solve`; where GTSAM has no factor of a measurement, or with constraints, it is refused.
 
     Args:
         problem: the first nodes, with an x0 where there are poses.
-        relinearizeThreshold: m or rad by which a node may be from where it was linearised.
-        relinearizeSkip: steps from one check of this to the next.
-        wildfireThreshold: m or rad, change below which it spreads no further.
         lag: steps after which a node that is used no more is forgotten, its information kept (GTSAM's
             IncrementalFixedLagSmoother); then there is no `update`. 0 for never.
+        params: gtsam.ISAM2Params; None: GTSAM's own, with QR, which takes no small pivot for zero.
 
     References:
         Kaess et al., iSAM2: incremental smoothing and mapping using the Bayes tree, IJRR 2012.
@@ -265,13 +257,9 @@ def incremental(
     if problem.constraints:
         hint = "Leave them out, or solve() with them."
         raise InputError("problem", f"with {len(problem.constraints)} constraints", "must have none", hint)
-    params = gtsam.ISAM2Params()
-    number("relinearizeThreshold", relinearizeThreshold, 0.0, allowed="a number >= 0", hint="GTSAM's own is 0.1.")
-    number("relinearizeSkip", relinearizeSkip, 1, kind=int, allowed="a whole number >= 1", hint="GTSAM's own is 10.")
-    number("wildfireThreshold", wildfireThreshold, 0.0, allowed="a number >= 0", hint="GTSAM's own is 1e-3.")
-    params.setRelinearizeThreshold(relinearizeThreshold)
-    params.relinearizeSkip = relinearizeSkip
-    params.setFactorization("QR")  # takes no small pivot for zero
-    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfireThreshold))
+    if params is None:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR")
+    instance("params", params, gtsam.ISAM2Params)
     number("lag", lag, 0, kind=int, allowed="a whole number >= 0", hint="0 forgets nothing.")
     return Incremental(problem, gtsam.IncrementalFixedLagSmoother(lag, params) if lag else gtsam.ISAM2(params), lag)
