@@ -137,24 +137,16 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
         hint = f"If you trust that file: load({str(path)!r}, net={card['kind']!r})."
         raise InputError(f"checkpoint {path}: kind", repr(card["kind"]), allowed, hint)
     made = find("coopoc.nets", net or card["kind"])
+    history = tensors.pop(_HISTORY, None)
     try:
         model: Gain = made(**card["net"])
-    except TypeError as error:
-        raise InputError(f"checkpoint {path}: net", card["net"], f"does not fit ({error})", "Train it again.") from None
-    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    expected = {name: tuple(p.shape) for name, p in model.named_parameters()}
-    if _HISTORY in tensors:
-        expected[_HISTORY] = (*shapes[_HISTORY][:1], sum(p.numel() for p in model.parameters()))
-    for name in sorted(expected.keys() | shapes.keys()):
-        if expected.get(name) != shapes.get(name):
-            raise InputError(
-                f"checkpoint {path}",
-                f"{name} of shape {shapes.get(name, 'missing')}",
-                f"expected {expected.get(name, 'no such tensor')}",
-                "Use a net of its card's settings.",
-            )
-    history = tensors.pop(_HISTORY, None)
-    model.load_state_dict(tensors)
+        model.load_state_dict(tensors)
+    except (TypeError, RuntimeError) as error:
+        why = " ".join(str(error).split())
+        raise InputError(f"checkpoint {path}: net", card["net"], f"does not fit ({why})", "Train it again.") from None
+    size = sum(p.numel() for p in model.parameters())
+    if history is not None and history.shape[1:] != (size,):
+        raise InputError(f"checkpoint {path}: history", history.shape, f"must be (rows, {size})", "Train it again.")
     return Checkpoint(model, card, history)
 
 

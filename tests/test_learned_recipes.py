@@ -69,11 +69,11 @@ def test_another_shape_history_and_kind_are_refused_naming_both(tmp_path):
     tensors["gain.weight"] = torch.zeros(9, 90)
     save_file(tensors, path, metadata={"card": '{"kind": "gain_net", "net": {"in_mult": 5, "out_mult": 40}}'})
     assert card["parameters"] == 23_928
-    with refused(r"gain.weight of shape \(9, 90\): expected \(9, 720\)"):
+    with refused(r"gain.weight: .*\[9, 90\].*\[9, 720\]"):
         load(path)
     longer = torch.zeros(2, 19_939)
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(), {}, longer))
-    with refused(r"history of shape \(2, 19939\): expected \(2, 19938\)"):
+    with refused(r"history = .*\[2, 19939\].*\(rows, 19938\)"):
         load(path)
     save_file({"x": torch.zeros(1)}, path, metadata={"card": "{}"})
     with refused("'kind': None"):
