@@ -5,7 +5,6 @@ import json
 import re
 from collections.abc import Iterable
 from importlib import metadata
-from importlib.util import find_spec
 from urllib.parse import unquote, urlsplit
 
 LONGEST_PART = 1500
@@ -108,15 +107,6 @@ def _where(package: str) -> str:
         return package
     editable = "-e " if source.get("dir_info", {}).get("editable") else ""
     return f"{editable}{package.replace('coopoc', unquote(urlsplit(url).path), 1)}"
-
-
-def require(library: str, needed_for: str) -> None:
-    """Raise MissingLibraryError unless the library is installed.
-
-    >>> require("numpy", "everything")
-    """
-    if find_spec(library) is None:
-        raise MissingLibraryError(library, needed_for, dependencies().get(library, library))
 
 
 def dependencies() -> dict[str, str]:

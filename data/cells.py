@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, named, number
-from coopoc.errors import InputError, require, said, suggestion, unknown
+from coopoc.errors import InputError, said, suggestion, unknown
 from coopoc.formats.values import MAX_NUMBER
 
 if TYPE_CHECKING:
@@ -63,7 +63,6 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     ending = path.suffix.lower()
     try:
         if ending == ".parquet":
-            require("pyarrow", "a Parquet table")
             from pyarrow.parquet import read_metadata
 
             size = read_metadata(path)  # a column of one value takes no room in the file

@@ -121,7 +121,7 @@ uses = {{
 for name, use in uses.items():
     try:
         use()
-    except co.MissingLibraryError as error:
+    except ImportError as error:
         print("refused", name, error)
     except co.InputError as error:
         print("another reason", name)

@@ -1,7 +1,6 @@
 """Tables and files that people take into their own notebook: `to_frame`, `write_tum`."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
@@ -101,10 +100,3 @@ def test_a_path_that_no_program_could_read_is_refused(tmp_path):
         with pytest.raises(co.InputError, match=named):
             write()
     assert not list(tmp_path.iterdir())
-
-
-def test_the_table_needs_pandas(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
-    with pytest.raises(co.MissingLibraryError, match=r"Track\.to_frame.*pip install pandas"):
-        track().to_frame()
-    assert pd.__version__

@@ -128,9 +128,6 @@ class Track:
         ids), `x`, `y`, `z` m; with a covariance `std_x`, `std_y`, `std_z` m, $\sqrt{P_{ii}}$; with a heading `heading`
         and `std_heading` rad; then the extras of shape (R, T, E).
 
-        Raises:
-            MissingLibraryError: there is no pandas.
-
         >>> Track([0.0], (0,), np.ones((1, 1, 1, 3)), None, [[0]], [[0]], 0.0).to_frame().columns.tolist()
         ['run', 'step', 't', 'ego', 'x', 'y', 'z']
         """
@@ -146,7 +143,7 @@ class Track:
             columns["heading"] = self.heading
         if self.heading_covariance is not None:
             columns["std_heading"] = np.sqrt(self.heading_covariance[..., 3])
-        return long_table("Track.to_frame", columns | {k: v for k, v in self.extras.items() if v.ndim == 3})
+        return long_table(columns | {k: v for k, v in self.extras.items() if v.ndim == 3})
 
 
 def of_recording(track: Track, recording: Recording) -> None:

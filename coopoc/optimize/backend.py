@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
 from ..arrays import TINY, Floats, number
-from ..errors import InputError, require, suggestion, unknown
+from ..errors import InputError, MissingLibraryError, dependencies, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
 
@@ -133,8 +133,9 @@ def require_backend(backend: str | Backend) -> Backend:
         backend = (_registered.__wrapped__ if ".py" in backend else _registered)(backend)  # a file may change
     elif not isinstance(backend, Backend):
         raise unknown("backend", backend, backends())
-    if backend.library is not None:
-        require(backend.library, f"backend {backend.name!r}")
+    if not backend.installed:
+        library = str(backend.library)
+        raise MissingLibraryError(library, f"backend {backend.name!r}", dependencies().get(library, library))
     return backend
 
 

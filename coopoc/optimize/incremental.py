@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, checked, instance, number
-from ..errors import InputError, require, shown
+from ..errors import InputError, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
 from .model.factor import Factor, fused, stacked, unchecked
@@ -243,7 +243,6 @@ def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Increment
 
     Raises:
         InputError: constraints, poses without an x0, a measurement that GTSAM has no factor for.
-        MissingLibraryError: gtsam is not installed.
 
     >>> live = incremental(Problem(("a",), dimension=2).add("position", "a", [0, 0], std=0.1))
     >>> live.add([("displacement", ("a", "b"), [5, 0], 0.1)], {"b": [4, 0]})
@@ -251,7 +250,6 @@ def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Increment
     (array([5., 0.]), np.float64(0.02), 'SOLVED')
     """
     instance("problem", problem, Problem)
-    require("gtsam", "incremental")
     import gtsam
 
     if problem.constraints:

@@ -117,9 +117,6 @@ those that were recorded. Give the fleet that was observed, its vehicles in the 
         Columns: `step`, `t` s, `vehicle` (its id), `x`, `y`, `z` m, `vx`, `vy`, `vz` m/s, and `heading` rad where the
         fleet has headings.
 
-        Raises:
-            MissingLibraryError: there is no pandas.
-
         >>> Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)), np.zeros((2, 2, 3))).to_frame().vehicle.tolist()
         ['a', 'b', 'a', 'b']
         """
@@ -127,7 +124,7 @@ those that were recorded. Give the fleet that was observed, its vehicles in the 
         columns |= {name: self.position[..., axis] for axis, name in enumerate("xyz")}
         columns |= {f"v{name}": self.velocity[..., axis] for axis, name in enumerate("xyz")}
         columns |= {} if self.heading is None else {"heading": self.heading}
-        return long_table("Fleet.to_frame", columns, self.present)
+        return long_table(columns, self.present)
 
     @property
     def _arrays(self) -> tuple[str, ...]:

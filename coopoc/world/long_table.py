@@ -6,30 +6,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..arrays import AnyArray, Bools
-from ..errors import missing
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def long_table(needed_for: str, columns: Mapping[str, AnyArray], where: Bools | None = None) -> "pd.DataFrame":
+def long_table(columns: Mapping[str, AnyArray], where: Bools | None = None) -> "pd.DataFrame":
     """A row per element of the arrays' common shape, the last axis fastest.
 
     Args:
-        needed_for: named where pandas is missing.
         columns: name -> array that broadcasts to the common shape.
         where: of the common shape, the elements to keep; all if None.
 
-    Raises:
-        MissingLibraryError: there is no pandas.
-
-    >>> long_table("", {"t": np.array([[0.0], [0.1]]), "x": np.array([[1.0, 2], [3, 4]])}).to_numpy().tolist()
+    >>> long_table({"t": np.array([[0.0], [0.1]]), "x": np.array([[1.0, 2], [3, 4]])}).to_numpy().tolist()
     [[0.0, 1.0], [0.0, 2.0], [0.1, 3.0], [0.1, 4.0]]
     """
-    try:
-        import pandas as pd
-    except ModuleNotFoundError as error:
-        raise missing(error, needed_for) from None
+    import pandas as pd
+
     kept = ... if where is None else where
     arrays = np.broadcast_arrays(*columns.values())
     return pd.DataFrame({name: array[kept].reshape(-1) for name, array in zip(columns, arrays, strict=True)})

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ...errors import InputError, require, said
+from ...errors import InputError, said
 from ...text import short_repr
 from ..model.problem import Problem
 from ..solution import Solution
@@ -82,7 +82,7 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
         refine: follow by `solve` from the rounded point.
 
     Raises:
-        InputError: as `quadratic`, or more than MAX_SHOR_ROWS constrained rows. MissingLibraryError: CVXPY.
+        InputError: as `quadratic`, or more than MAX_SHOR_ROWS constrained rows.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> relaxed = shor(problem.add("range", ("a", "b"), 6.0, std=1.0))
@@ -118,7 +118,6 @@ def semidefinite(
 
     It takes C (bound, bound) and returns the multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
     """
-    require("cvxpy", "a convex relaxation")
     cvxpy: Any = importlib.import_module("cvxpy")
     (n, k), (m, q) = stiefel, sphere
     size = n * k + m * q

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ...errors import InputError, require
+from ...errors import InputError
 from .factor import LOSSES, Factor, Loss, stacked
 from .measurements import CONVERTED, Measurement, converted_rows
 from .space import Space
@@ -267,9 +267,7 @@ def write(kind: Kind, model: Model) -> Written:
 
     Raises:
         InputError: CasADi cannot run the formula, or no tape has an operation of it.
-        MissingLibraryError: CasADi is not installed.
     """
-    require("casadi", "the derivative of a measurement")
     import casadi as ca
 
     if model == "converted":
