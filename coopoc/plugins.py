@@ -4,10 +4,8 @@ Entry points name those of installed distributions; "folder/mine.py:NAME" one of
 """
 
 import ast
-import difflib
 import hashlib
 import importlib.util
-import os
 import sys
 from collections.abc import Mapping
 from functools import cache, lru_cache
@@ -16,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from .errors import InputError, missing, unknown
+from .errors import InputError, missing, suggestion, unknown
 
 GROUPS = {
     "coopoc.datasets": "data set",
@@ -44,7 +42,7 @@ def points(group: str) -> Mapping[str, metadata.EntryPoint]:
     class; each is therefore made anew as Python's own.
     """
     entry_points: dict[str, metadata.EntryPoint] = {}
-    for point in _installed(group, tuple(_changed(folder) for folder in sys.path)):
+    for point in _installed(group, tuple(sys.path)):
         other = entry_points.setdefault(point.name, metadata.EntryPoint(point.name, point.value, point.group))
         if other.value != point.value:
             claims = f"is claimed by {other.value} and {point.value}"
@@ -53,18 +51,10 @@ def points(group: str) -> Mapping[str, metadata.EntryPoint]:
 
 
 @lru_cache(64)
-def _installed(group: str, folders: tuple[tuple[str, int], ...]) -> tuple[metadata.EntryPoint, ...]:
-    """Entry points by name. Python reads every distribution at each call, 15 ms for two hundred; once does while no
-    folder of the path changes."""
+def _installed(group: str, folders: tuple[str, ...]) -> tuple[metadata.EntryPoint, ...]:
+    """Entry points by name, read once: Python reads every distribution at each call, 15 ms for two hundred. What is
+    installed while Python runs is there when it starts again."""
     return tuple(sorted(metadata.entry_points(group=group), key=lambda point: point.name))
-
-
-def _changed(folder: str) -> tuple[str, int]:
-    """A folder of the path and when a distribution may last have come or gone, ns."""
-    try:
-        return folder, os.stat(folder or ".").st_mtime_ns
-    except OSError:
-        return folder, 0
 
 
 def names(group: str) -> tuple[str, ...]:
@@ -240,8 +230,7 @@ def from_file(name: str, noun: str = "object") -> Any:
     module = _module(str(Path(path).resolve()), file_digest(name, noun))
     if not hasattr(module, attribute):
         own = [n for n, value in vars(module).items() if not n.startswith("_") and not isinstance(value, ModuleType)]
-        near = difflib.get_close_matches(attribute, own, n=1)
-        hint = f"Did you mean {path}:{near[0]}?" if near else "Name what the file defines."
+        hint = suggestion(attribute, own, "Name what the file defines.")
         raise InputError(noun, repr(name), f"is not in the file, which has {', '.join(own) or 'no names'}", hint)
     return getattr(module, attribute)
 
