@@ -90,12 +90,6 @@ def test_it_says(made, words):
     assert words in made[1].text
 
 
-def test_files_can_be_taken_out_of_it(made):
-    text = made[0].read_text()
-    for name in ("small-rt_le.csv", "small-rt_le.tex", "small-rt_le.pdf", "small-rt_le.png"):
-        assert f'download="{name}"' in text
-
-
 def test_the_same_folders_give_the_same_page(made, tmp_path):
     path, _ = made
     folder = path.parents[1] / "small"

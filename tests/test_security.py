@@ -180,7 +180,7 @@ def test_a_figure_that_is_a_link_out_of_the_folder_is_not_embedded(folder, tmp_p
         report([folder], tmp_path / "report.html")
     for form in ("svg", "pdf", "png"):
         (folder / "figures" / f"f.{form}").unlink()
-    with refused(r"lacks figures/f\.pdf\. Repeat coopoc run"):
+    with refused(r"lacks figures/f\.svg\. Repeat coopoc run"):
         report([folder], tmp_path / "report.html")
 
 

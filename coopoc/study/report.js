@@ -55,7 +55,7 @@
     button.addEventListener("click", () => {
       button.textContent = figure.classList.toggle("large") ? "Fit" : "Enlarge";
     });
-    (figure.querySelector(".files") ?? figure.querySelector("figcaption")).append(button);
+    figure.querySelector("figcaption").append(button);
   }
 
   // The last section whose head has come past the upper third of the window is the one that is read.

@@ -19,13 +19,8 @@ from .style import look, title, words
 from .tables import Table
 
 OWN = Path(__file__).parent
-_MIME = {
-    "csv": "text/csv",
-    "tex": "text/x-tex",
-    "pdf": "application/pdf",
-    "png": "image/png",
-    "svg": "image/svg+xml",
-}
+LARGEST_DRAWING = 1_000_000
+"""Bytes of an SVG beyond which the page shows the PNG."""
 
 
 def report(
@@ -89,8 +84,11 @@ def _section(folder: Path) -> dict[str, Any]:
         "environment": results.environment,
         "pending": results.pending,
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
-        "tables": [_table(view, results.study) for view in shown["tables"]],
-        "figures": [_figure(folder, view, results.study) for view in shown["figures"]],
+        "tables": [
+            {**view, "html": Markup(Table.from_data(view.get("table")).to_html())}  # HTML on the disk is never embedded
+            for view in shown["tables"]
+        ],
+        "figures": [_figure(folder, view) for view in shown["figures"]],
         "failures": [
             {"cell": ", ".join(title(axis, row[axis]) for axis in results.axes if axis in row), "reason": row["reason"]}
             for _, row in results.failures.iterrows()
@@ -98,30 +96,14 @@ def _section(folder: Path) -> dict[str, Any]:
     }
 
 
-def _table(view: Mapping[str, Any], study: str) -> dict[str, Any]:
-    """A table, made anew from its numbers: HTML on the disk is never embedded."""
-    table = Table.from_data(view.get("table"))
-    texts = {"csv": table.to_csv(), "tex": table.to_latex()}
-    files = [_file(f"{study}-{view['name']}", form, text.encode()) for form, text in texts.items()]
-    return {**view, "html": Markup(table.to_html()), "files": files}
-
-
-def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]:
-    content = {}
-    for form in ("pdf", "png", "svg"):
-        path = inside(folder, folder / "figures" / f"{view['name']}.{form}")
+def _figure(folder: Path, view: Mapping[str, Any]) -> dict[str, Any]:
+    svg, png = (inside(folder, folder / "figures" / f"{view['name']}.{form}") for form in ("svg", "png"))
+    for path in (svg, png):
         if not path.is_file():
             hint = "Repeat coopoc run: it writes the views again."
             raise InputError("folder", str(folder), f"lacks figures/{path.name}", hint)
-        content[form] = path.read_bytes()
-    name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= 1_000_000 else "png"
-    files = [_file(name, form, content[form]) for form in ("pdf", "png")]
-    return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
-
-
-def _file(name: str, form: str, content: bytes) -> dict[str, str]:
-    uri = f"data:{_MIME[form]};base64,{base64.b64encode(content).decode()}"
-    return {"form": form.upper(), "name": f"{name}.{form}", "uri": uri}
+    path, kind = (svg, "svg+xml") if svg.stat().st_size <= LARGEST_DRAWING else (png, "png")
+    return {**view, "uri": f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"}
 
 
 def _template() -> jinja2.Template:
