@@ -14,6 +14,7 @@ from tqdm import tqdm
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Status, pose, solve
 from coopoc.optimize.convex.relaxation import Relaxation, shor
+from coopoc.optimize.model.problem import Search
 
 Case = Callable[[int], Problem]
 
@@ -151,8 +152,8 @@ def row(name: str, case: Case, seeds: int) -> str:
         relaxed.append(shor(problem))
         best = relaxed[-1].solution
         assert best is not None
-        blind = problem if problem.x0 is not None and not problem.fixed else replace(problem, x0=_blind(problem, seed))
-        found = solve(blind, throw=False)
+        start = problem.x0 if problem.x0 is not None and not problem.fixed else _blind(problem, seed)
+        found = solve(replace(problem, x0=start, search=Search("alone", x0=start)), throw=False)
         alone += found.status is Status.SOLVED and found.cost <= best.cost * (1 + 1e-6) + 1e-9
     gaps = np.array([r.gap / max(r.lower_bound + r.gap, 1e-12) for r in relaxed])
     tight = sum(r.tight for r in relaxed)

@@ -17,6 +17,7 @@ import numpy as np
 
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.convex import certify, shor
+from coopoc.optimize.model.problem import Search
 
 ANCHOR_STD, RANGE_STD = 0.3, 0.1
 
@@ -47,7 +48,7 @@ def scene(seed: int, anchors: int = 4, vehicles: int = 2) -> Problem:
 def judge(problem: Problem, seed: int) -> Row:
     """Gauss-Newton from a random start with its certificate, then the relaxation."""
     start = np.random.default_rng([seed, 1]).uniform(-20, 20, (len(problem.names), 2))
-    blind = solve(replace(problem, x0=start), throw=False)
+    blind = solve(replace(problem, x0=start, search=Search("blind", x0=start)), throw=False)  # and from nowhere else
     relaxed = shor(problem)
     assert relaxed.solution is not None
     return Row(blind.cost, certify(problem, blind).certified, relaxed.lower_bound, relaxed.solution.cost, relaxed.tight)

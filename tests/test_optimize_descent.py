@@ -7,6 +7,7 @@ import coopoc as co
 from coopoc import workers
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.descent import levenberg_marquardt
+from coopoc.optimize.model.problem import Search
 
 
 def test_damping_grows_until_a_step_helps_however_much_that_takes():
@@ -30,7 +31,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
     distance = np.linalg.norm([truth[i] - truth[j] for i, j in pairs], axis=1) + rng.normal(0, 0.5, (3, 10))
 
     def solved(unit):
-        problem = Problem(names, x0=start).add("position", names, truth, std=2.0 * unit)
+        problem = Problem(names, x0=start, search=Search(x0=start)).add("position", names, truth, std=2.0 * unit)
         ends = [(names[i], names[j]) for i, j in pairs]
         found = [solve(problem.add("range", ends, measured, std=0.1 * unit)) for measured in distance]
         return [one.iterations for one in found], [one.cost * unit**2 for one in found]

@@ -16,6 +16,7 @@ from coopoc.formats import load_graph
 from coopoc.optimize import Loss, Problem, Status, solve
 from coopoc.optimize.assess.assess import TAIL
 from coopoc.optimize.graph_problems import from_graph
+from coopoc.optimize.model.problem import Search
 
 
 def ranged(seed: int) -> Problem:
@@ -25,7 +26,8 @@ def ranged(seed: int) -> Problem:
     x0 = rng.uniform(-20, 20, (8, 3))
     z = np.array([[np.linalg.norm(truth[j] - truth[i]) + rng.normal(0, 0.1)] for i, j in pairs])
     fixes = truth[:3] + rng.normal(0, 0.3, (3, 3))
-    problem = Problem([f"v{k}" for k in range(8)], x0=x0).add("position", range(3), fixes, std=0.3)
+    alone = Search("random", x0=x0)
+    problem = Problem([f"v{k}" for k in range(8)], x0=x0, search=alone).add("position", range(3), fixes, std=0.3)
     return problem.add("range", pairs, z, std=0.1)
 
 

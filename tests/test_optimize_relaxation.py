@@ -22,6 +22,7 @@ from coopoc.optimize.convex import certify, reduced, shor
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
 from coopoc.optimize.convex.reduced import Reduced
 from coopoc.optimize.graph_problems import from_graph, read_graph
+from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import exp
 
 UP = 0.6
@@ -233,9 +234,8 @@ def minima(problem: Problem, starts: int = 15) -> list[Solution]:
     """The minima that Gauss-Newton reaches from random starts, the lowest first."""
     rng, found = np.random.default_rng(0), []
     for _ in range(starts):
-        solution = solve(
-            replace(problem, x0=rng.uniform(-20, 20, (len(problem.names), problem.dimension))), throw=False
-        )
+        x0 = rng.uniform(-20, 20, (len(problem.names), problem.dimension))
+        solution = solve(replace(problem, x0=x0, search=Search("random", x0=x0)), throw=False)
         if solution.status is Status.SOLVED:
             found.append(solution)
     return sorted(found, key=lambda solution: solution.cost)

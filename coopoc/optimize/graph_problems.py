@@ -102,7 +102,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     if won.start.startswith("file") and not graph.guess:
         notes.append("the start is the file's vertices, which may be the truth")
-    return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
+    search = won._replace(seconds=clock() - began, notes=(*notes, *won.notes), x0=problem.x0)
+    return problem.replace_unchecked(search=search)
 
 
 def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | None = None) -> tuple[Problem, Search]:

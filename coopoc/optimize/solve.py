@@ -17,10 +17,10 @@ from .descent.levenberg_marquardt import arrive
 from .graph_problems import started
 from .model.factor import fused
 from .model.measurements import CONVERTED
-from .model.problem import Problem
+from .model.problem import Problem, Search
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
-from .starts.initial import directed, guessed, somewhere, undirected
+from .starts.initial import converted, directed, guessed, somewhere, undirected
 from .starts.mirrors import scaled
 from .starts.race import (
     ELSEWHERE,
@@ -46,6 +46,8 @@ NEWTON_DECREASE = 1e-8
 """That of a Newton step where Gauss-Newton's step is below the tolerance: 1e-4 standard deviations away."""
 DRAWN_STEPS = 20
 """From each random place, of problems with constraints."""
+ASTRAY_SHARE = 0.25
+"""Share of the extent of points by which an x0 may err and its `smooth` way needs no random starts beside it."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 COVARIANCE_NODES = 1000
@@ -113,7 +115,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     load(*LIBRARIES)
     began, earlier = clock(), problem.search.seconds
     backend.check(problem, options)
-    given = problem.poses and problem.x0 is not None and not problem.search.start and not problem.constraints
+    if given := problem.x0 is not None and not np.array_equal(problem.x0, problem.search.x0):  # type: ignore[arg-type]
+        problem = problem.replace_unchecked(search=Search(notes=problem.search.notes))
     problem = started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
@@ -121,7 +124,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     if constraints:  # which the search for a start leaves to the solver
         problem = problem.replace_unchecked(constraints=())
     if searching:
-        problem = _searched(problem, start)
+        problem = _searched(problem, start, None, True)
     built, searched = clock(), problem.search.seconds
     if any(f.loss is not None and (not f.loss.convex or problem.x0 is None) for f in problem.factors):
         problem = robust_start(problem, start if problem.x0 is None else problem.x0)
@@ -131,8 +134,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     result = backend.run(problem, start, options)
     if searching and constraints:
         problem, result = _drawn(problem, backend, options, result)
-    elif given:
-        problem, result = _challenged(problem, backend, options, result)
+    elif given and not constraints:
+        problem, result = _challenged(problem, backend, options, result, whole)
     search = problem.search
     solved = clock()
     x, iterations = result.x, result.iterations
@@ -168,12 +171,12 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     )
 
 
-def _searched(problem: Problem, start: Floats) -> Problem:
-    """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or
-    random starts lead lowest."""
+def _searched(problem: Problem, start: Floats, end: Floats | None, draws: bool) -> Problem:
+    """A problem of points from where its converted measurements (n, d), multidimensional scaling, random starts, if it
+    `draws`, or an x0, which led to the `end` (n, d), lead lowest."""
     starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
     began = clock()
-    problem, won = race(problem, starts, {}, draws=True)
+    problem, won = race(problem, starts, {}, draws=draws, reached=end)
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
@@ -200,26 +203,32 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
 
 
 def _challenged(
-    problem: Problem, backend: Backend, options: Options, first: SolverResult
+    problem: Problem, backend: Backend, options: Options, first: SolverResult, whole: bool
 ) -> tuple[Problem, SolverResult]:
-    """The result from a given x0 of poses; where the way from there was long and not `smooth`, the lower of it and that
-    from where the measurements lead, which a note names."""
+    """The result from a given x0; where the way from there was long and not `smooth`, or of points whose vectors are
+    not measured as a `whole`, the lower of it and that from where the measurements lead, which a note names."""
     system, record = sparse(problem), first.extras.get("record")
     if record is None:
         record = arrive(system, np.asarray(problem.x0), FIRST_STEPS, RACE_TOLERANCE, smooth=True).record
     cost = system.cost(first.x)
-    near = not np.isfinite(cost) or smooth(record) or record[0, 0] - cost <= RIVAL_COST
+    straight, sure = smooth(record), whole or bool(problem.poses)
+    near = not np.isfinite(cost) or (straight and sure) or record[0, 0] - cost <= RIVAL_COST
     if near or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
-    other = started(problem, first.x)
-    search, least = other.search, system.cost(np.asarray(other.x0))
+    if problem.poses:
+        other = started(problem, first.x)
+    else:
+        astray = np.abs(first.x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(first.x, axis=0).max()
+        draws = bool(not whole and (astray or not straight))
+        other = _searched(problem, converted(problem, first.x)[0], first.x, draws)
+    search, said, least = other.search, problem.search.notes, system.cost(np.asarray(other.x0))
     search = search._replace(iterations=search.iterations + first.iterations)
     if higher(cost, least):
         note = f"x0 leads to a higher minimum, of cost {cost:.4g}: start {search.start!r} led here"
-        other = other.replace_unchecked(search=search._replace(notes=(*search.notes, note)))
+        other = other.replace_unchecked(search=search._replace(notes=(*said, *search.notes, note)))
         return other, backend.run(other, np.asarray(other.x0), options)
     notes = reached_once([cost, least], cost) if higher(least, cost) else search.notes
-    return problem.replace_unchecked(search=problem.search._replace(notes=notes)), first
+    return problem.replace_unchecked(search=problem.search._replace(notes=(*said, *notes))), first
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:

@@ -43,6 +43,7 @@ class Search(NamedTuple):
         iterations: linear steps from all starts that were tried.
         seconds: to make the starts and to take those steps.
         notes: what is to be said of it, for `Solution.notes`.
+        x0: where it led, or a start that is to be the only one: with another x0 of a problem others compete.
 
     >>> Search("odometry").iterations
     0
@@ -52,6 +53,7 @@ class Search(NamedTuple):
     iterations: int = 0
     seconds: float = 0.0
     notes: tuple[str, ...] = ()
+    x0: Floats | None = None
 
     @property
     def extras(self) -> dict[str, str | int | float]:

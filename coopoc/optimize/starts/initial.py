@@ -31,10 +31,10 @@ def guessed(problem: Problem) -> tuple[Floats, bool]:
         return problem.x0.copy(), True
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give coopoc.optimize.pose(position, angle).")
-    return _converted(problem, np.zeros((len(problem.names), problem.dimension)))
+    return converted(problem, np.zeros((len(problem.names), problem.dimension)))
 
 
-def _converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
+def converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     """Points (n, d) where vectors put them, from any x, and whether these touch all that can move."""
     system = sparse(problem)
     _, gradient, values = system.quadratic(x, "converted")
