@@ -12,9 +12,9 @@ from pathlib import Path
 
 import torch
 
+from coopoc.data.registry import load_fleet
 from coopoc.errors import unknown
 from coopoc.evaluate.metrics import nees_inside, rt_le
-from coopoc.fleets import load_fleet
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of

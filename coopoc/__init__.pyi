@@ -1,5 +1,8 @@
 """The public names of coopoc, each with its home. `__init__.py` reads them here."""
 
+from .data.fetch import fetch as fetch
+from .data.registry import load_fleet as load_fleet
+from .data.registry import read_log as read_log
 from .errors import InputError as InputError
 from .errors import MissingLibraryError as MissingLibraryError
 from .evaluate.bounds import bound_rt_le as bound_rt_le
@@ -16,9 +19,6 @@ from .evaluate.pictures import plot_recording as plot_recording
 from .evaluate.pictures import plot_solution as plot_solution
 from .evaluate.pictures import plot_track as plot_track
 from .evaluate.statistics import paired_difference as paired_difference
-from .fleets import fetch as fetch
-from .fleets import load_fleet as load_fleet
-from .fleets import read_log as read_log
 from .formats.trajectories import write_tum as write_tum
 from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV

@@ -12,7 +12,7 @@ from coopoc.arrays import one_of
 from coopoc.paths import replaceable, write
 
 from .fetch import Entry, fetch, public
-from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, load_log
+from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, read_log
 from .source import split
 
 
@@ -66,7 +66,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
         _print(name, in_words(card(name)))
         return
     if kind_of(name) in LOGS:
-        log = load_log(name)
+        log = read_log(name)
         print(log.summary)
         if log.truth is None:
             return
@@ -109,7 +109,7 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
 
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
     one_of("ending of --picture", replaceable(out).suffix, (".png", ".pdf", ".svg", ".jpg"))
-    log = load_log(path)
+    log = read_log(path)
     print(log.summary)
     try:
         result = checked(log)

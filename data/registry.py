@@ -1,4 +1,4 @@
-"""load_fleet, load_log: a bundled name, a file or a folder -> Fleet or Log, by the registry of formats."""
+"""load_fleet, read_log: a bundled name, a file or a folder -> Fleet or Log, by the registry of formats."""
 
 import inspect
 import json
@@ -16,7 +16,8 @@ from coopoc.world.storage import read_recording
 from .cells import TABLES
 from .fetch import bring
 from .fleet_files import read_fcd, read_table, read_tum, tum_files
-from .log.read import Log, is_log, read_log, steps_in_words
+from .log import read as logs
+from .log.read import Log, is_log, steps_in_words
 from .log.units import Summary
 from .mrclam import MAX_GAP, read_mrclam
 from .source import parted, split, there
@@ -80,10 +81,10 @@ def _stored_log(path: Path) -> Log:
     return Log(recording, truth, Summary(path.name, grid, vehicles, {"links": len(recording.links)}), True)
 
 
-@wraps(read_log)
+@wraps(logs.read_log)
 def _graph_log(path: Path, **options: Any) -> Log:
     """In body frames; a factor graph states all its noise, so that no error lasts."""
-    log = read_log(path, **{"frame": "body", "dt": 0.1, **options})
+    log = logs.read_log(path, **{"frame": "body", "dt": 0.1, **options})
     whole = replace(log.recording.sensors, range_offset_std=0.0, speed_scale_std=0.0, yaw_rate_bias_std=0.0)
     return replace(log, recording=replace(log.recording, sensors=whole))
 
@@ -91,7 +92,7 @@ def _graph_log(path: Path, **options: Any) -> Log:
 LOGS: Mapping[str, Callable[..., Log]] = {
     "pyfg": _graph_log,
     "recording": _stored_log,
-    "log": read_log,
+    "log": logs.read_log,
 }
 """Formats of real measurements -> reader; one of several files or endings belongs to `log.read.READERS`."""
 DRIVES: Mapping[str, Callable[..., Fleet]] = {
@@ -111,7 +112,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     Args:
         name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
-            CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, or a log with a truth (`load_log`). Options may stand behind
+            CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, or a log with a truth (`read_log`). Options may stand behind
             a question mark, as in "drive.csv?dt=0.1&columns=t:time".
         format: one of DRIVES or LOGS, instead of the one found from name and contents.
         options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, scale; of all, since and
@@ -150,13 +151,14 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     return fleet
 
 
-def load_log(name_or_path: str | Path, **options: Any) -> Log:
+def read_log(name_or_path: str | Path, **options: Any) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
-        name_or_path: tables, NMEA and bags (`read_log`), a PyFG file (in body frames), an .npz of `save_recording`, a
-            public data set that has been fetched; options may stand behind a question mark, as in "drive?dt=0.1".
-        options: of the reader; of all, since and until, s after the first step, of the part that is kept.
+        name_or_path: tables, NMEA and bags, a PyFG file (in body frames), an .npz of `save_recording`, a public data
+            set that has been fetched; options may stand behind a question mark, as in "drive?dt=0.1".
+        options: of the reader, see `coopoc.data.log.read.read_log`; of all, since and until, s after the first step, of
+            the part that is kept.
 
     Raises:
         InputError: no such path, an unknown option, or a file with a fault.
@@ -170,7 +172,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
             "is a folder of MR.CLAM, whose noise has to be calibrated first",
             "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam.",
         )
-    log: Log = _read(LOGS.get(kind, read_log), Path(name), options)
+    log: Log = _read(LOGS.get(kind, logs.read_log), Path(name), options)
     return log.part(**part)
 
 

@@ -37,7 +37,7 @@ SECTIONS = {
     "optimize": ("Problems and solvers", "Problems, factors, `solve`."),
     "evaluate": ("Evaluation", "Metrics, bounds, statistics, pictures."),
     "study": ("Studies", "Grids of cells, results, views."),
-    "fleets": ("Files", "Drives, graphs and logs from files."),
+    "data": ("Files", "Drives, graphs and logs from files."),
     "formats": ("Trajectory files", "Estimates for other programs."),
     "errors": ("Errors", "What is raised on bad input."),
 }

@@ -16,7 +16,7 @@ from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
 from coopoc.data.log.residuals import begin_of, together
 from coopoc.data.mrclam import calibrate, pose_recording, read_mrclam, surveyed
-from coopoc.data.registry import kind_of, load_log
+from coopoc.data.registry import kind_of, read_log
 from coopoc.data.source import split
 from coopoc.study.study import Params
 from coopoc.world.storage import digest
@@ -107,7 +107,7 @@ def source(data: str) -> Source:
         hint = "Check it; a log may hold what vehicles measured (docs/your_data.md), a folder a set of MR.CLAM."
         allowed = "must be the path of measurements, not only of drives"
         raise InputError("data", repr(data), allowed, hint if Path(name).exists() else bring(name, hint))
-    log = load_log(data)
+    log = read_log(data)
     if log.recording.body is None:
         hint = f"Take coopoc run side_by_side --data {data!r}."
         raise InputError("data", repr(data), "is a log in the world's frame, and filters here estimate headings", hint)

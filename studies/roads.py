@@ -10,7 +10,6 @@ import numpy as np
 from coopoc import V2X, Fleet, InputError, Method, Recording, Sensors, observe, read_log
 from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
-from coopoc.data.registry import load_log
 from coopoc.data.source import split
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
@@ -67,7 +66,7 @@ def seen(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         if files:
             log = read_log(files[0], **({"truth": files[1]} if files[1:] else {"dt": COMMA_STEP}))
         else:
-            log = load_log(str(data))
+            log = read_log(str(data))
         if log.truth is None:
             raise InputError("data", str(data), "must hold a truth", 'Name its file: "LOG?truth=FILE".')
         recording, truth = log.recording, log.truth

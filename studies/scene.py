@@ -54,11 +54,11 @@ def _log(data: str) -> "Log | None":
         InputError: one in body frames.
     """
     there(split(data)[0])
-    from coopoc.data.registry import LOGS, kind_of, load_log  # pandas, which a mistake need not wait for
+    from coopoc.data.registry import LOGS, kind_of, read_log  # pandas, which a mistake need not wait for
 
     if kind_of(data) not in LOGS:
         return None
-    log = load_log(data)
+    log = read_log(data)
     if log.recording.body is not None:
         hint = f"Take coopoc run real --data {data!r}, whose filters estimate headings."
         raise InputError("data", repr(data), "is a log in body frames, and methods here follow positions", hint)

@@ -60,10 +60,10 @@ def drives(clients: str) -> "Drives":
     """What nets are trained on: a fleet, whose measurements are simulated, or of real data its own measurements."""
     if not is_real(clients):
         return fleet(clients)
-    from coopoc.data.registry import load_log
+    from coopoc.data.registry import read_log
     from coopoc.learned.training.drives import drives_of
 
-    return drives_of(load_log(clients))
+    return drives_of(read_log(clients))
 
 
 def _recipe(name: str) -> str:
@@ -140,9 +140,9 @@ def fitted(clients: str, reading: VelocityReading) -> "NoiseModel":
     from coopoc import NoiseModel
 
     if is_real(clients):
-        from coopoc.data.registry import load_log
+        from coopoc.data.registry import read_log
 
-        return NoiseModel.fitted(load_log(clients).recording, fleet(clients))
+        return NoiseModel.fitted(read_log(clients).recording, fleet(clients))
     acting, moving = Sensors.paper_training(reading), fleet(clients)
     return NoiseModel.fitted(observe(moving, acting, V2X(max_neighbours=0), seed=0), moving)
 

@@ -16,7 +16,7 @@ from shell import ROOT
 
 import coopoc as co
 from coopoc.data.log.residuals import TRUE_POSE_STD, together
-from coopoc.data.registry import load_log
+from coopoc.data.registry import read_log as load_log
 from coopoc.studies import benchmark, tasks
 from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
 

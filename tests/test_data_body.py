@@ -17,7 +17,7 @@ from strange_logs import strange
 import coopoc as co
 from coopoc.data.log.check import check as check_poses
 from coopoc.data.log.residuals import begin_of, together
-from coopoc.data.registry import load_log
+from coopoc.data.registry import read_log as load_log
 from coopoc.evaluate.metrics import innovation_columns
 from coopoc.studies import real
 

@@ -16,7 +16,7 @@ import coopoc as co
 from coopoc.arrays import Floats
 from coopoc.data.log.check import check
 from coopoc.data.log.read import Log, read_log
-from coopoc.data.registry import load_log
+from coopoc.data.registry import read_log as load_log
 
 
 def said(log: Log) -> str:

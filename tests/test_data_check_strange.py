@@ -12,7 +12,7 @@ from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.check import check
-from coopoc.data.registry import load_log
+from coopoc.data.registry import read_log as load_log
 
 PAIRS = {("drone0", "drone1"): 0.45, ("drone1", "drone3"): -0.25, ("drone0", "drone2"): 0.6}
 DRONES: dict[str, Any] = {"pairs": PAIRS, "clocks": {"drone1": 0.3, "drone3": -0.12}}

@@ -20,7 +20,8 @@ from coopoc.cli import _status
 from coopoc.data import commands  # noqa: F401  binds the registry before a test replaces it
 from coopoc.data import fetch as fetching
 from coopoc.data.fetch import Entry, public
-from coopoc.data.registry import kind_of, load_log
+from coopoc.data.registry import kind_of
+from coopoc.data.registry import read_log as load_log
 from coopoc.world.storage import digest
 
 DRIVE = "t,vehicle,x,y,vx,vy\n" + "".join(f"{t},a,{9 * t},0,9,0\n" for t in range(4000))

@@ -16,7 +16,7 @@ from strange_logs import strange
 import coopoc as co
 from coopoc.data.log.motion import Signal, step_means
 from coopoc.data.log.read import read_log
-from coopoc.data.registry import load_log
+from coopoc.data.registry import read_log as load_log
 from coopoc.evaluate.metrics import nees
 
 

@@ -16,7 +16,8 @@ import coopoc as co
 from coopoc.cli import _status
 from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
-from coopoc.data.registry import load_fleet, load_log
+from coopoc.data.registry import load_fleet
+from coopoc.data.registry import read_log as load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.evaluate.scores import scored
 from coopoc.studies import neighbours, scene

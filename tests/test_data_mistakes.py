@@ -13,7 +13,8 @@ from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.read import read_log
-from coopoc.data.registry import kind_of, load_log
+from coopoc.data.registry import kind_of
+from coopoc.data.registry import read_log as load_log
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
 GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(

@@ -13,7 +13,8 @@ from scipy.linalg import lstsq
 import coopoc as co
 from coopoc.arrays import robust_std
 from coopoc.data.mrclam import ROBUST, calibrate, grouped, pose_recording, read_mrclam
-from coopoc.data.registry import load_fleet, load_log
+from coopoc.data.registry import load_fleet
+from coopoc.data.registry import read_log as load_log
 from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_frames import gauss_markov, midway, turned
 from coopoc.world.links import wrap

@@ -17,8 +17,8 @@ from random_graphs import PAIR
 from shell import ROOT, python, ran
 
 from coopoc import GNSS, V2X, JointFilter, Kalman, Sensors, observe, rt_le
+from coopoc.data.registry import load_fleet
 from coopoc.evaluate.metrics import measure
-from coopoc.fleets import load_fleet
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find, from_file

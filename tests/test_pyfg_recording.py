@@ -13,7 +13,7 @@ from shell import ran
 
 import coopoc as co
 from coopoc.data.commands import check as data_check
-from coopoc.data.registry import load_log
+from coopoc.data.registry import read_log as load_log
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.body_frames import body_motion
 from coopoc.world.links import wrap

@@ -9,7 +9,8 @@ from safetensors.torch import save as to_bytes
 
 from coopoc import read_graph
 from coopoc.data.log.read import read_log
-from coopoc.data.registry import load_fleet, load_log
+from coopoc.data.registry import load_fleet
+from coopoc.data.registry import read_log as load_log
 from coopoc.formats.seals import UNSEALED, sealed
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
