@@ -167,7 +167,7 @@ def crossing() -> Fleet:
 @pytest.fixture(scope="session")
 def dense(formation: Fleet) -> Recording:
     """Ten neighbours at 22 m."""
-    return observe(formation.between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=4, observers=[0])
+    return observe(formation.between(0, 40), Sensors.paper_scenario2(), V2X(10), runs=4, observers=[0])
 
 
 @pytest.fixture(scope="session")

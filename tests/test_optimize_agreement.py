@@ -34,9 +34,7 @@ from coopoc.optimize.graph_problems import from_graph
 
 def spherical() -> Problem:
     """A snapshot of town10 with up to ten neighbours, range, azimuth and inclination."""
-    seen = observe(
-        load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=1, observers=[24]
-    )
+    seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X(10), runs=1, observers=[24])
     return Problem.from_snapshot(seen, 30, 24)
 
 
@@ -154,7 +152,7 @@ def backends_lacking(backend: str, problem: Problem) -> list[str]:
 
 
 def test_graduated_non_convexity_calls_a_plug_in():
-    seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(6), runs=2, observers=[5])
+    seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X(6), runs=2, observers=[5])
     star = Problem.from_snapshot(seen, 36, 5, run=1)
     wrong = star.add("position", 1, star.factors[0].z[1] + 40.0, std=3.5)
     found, ours = (solve_gnc(wrong, [0, 2], backend=b) for b in (PLUG_IN, "gauss-newton"))

@@ -221,7 +221,7 @@ def test_a_point_that_can_turn_around_another_is_free(backend):
 def incomplete():
     """Half of the fixes are missing; of the relative measurements some all, some the azimuth, some the range."""
     fleet = load_fleet("town10").between(0, 30)
-    seen = observe(fleet, Sensors.paper_scenario2(), V2X.ideal(6), runs=4, observers=[5])
+    seen = observe(fleet, Sensors.paper_scenario2(), V2X(6), runs=4, observers=[5])
     rng = np.random.default_rng(0)
     gnss, relative = seen.gnss.copy(), seen.relative.copy()
     gnss[rng.random(gnss.shape[:3]) < 0.5] = np.nan

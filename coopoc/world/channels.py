@@ -37,7 +37,7 @@ def lost(draws: Floats, loss: float, burst: float) -> Bools:
     return bad
 
 
-CHANNELS: Mapping[str, Callable[[int], V2X]] = {"ideal": V2X.ideal, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
+CHANNELS: Mapping[str, Callable[[int], V2X]] = {"ideal": V2X, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
 """Largest number of neighbours -> V2X. "ideal" counts payload only."""
 
 

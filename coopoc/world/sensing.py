@@ -42,7 +42,7 @@ def observe(
     Args:
         fleet: the truth.
         sensors: the noise that acts.
-        v2x: neighbourhood and channel, default V2X.ideal().
+        v2x: neighbourhood and channel, default V2X().
         runs: R.
         seed: of all draws.
         observers: vehicles whose links are recorded (default all); fewer is faster and changes no other draws.
@@ -62,7 +62,7 @@ def observe(
     Recording(3 runs x 2 steps x 2 vehicles, 4 links, K <= 1)
     """
     fleet, sensors = instance("fleet", fleet, Fleet), instance("sensors", sensors, Sensors)
-    v2x = V2X.ideal() if v2x is None else instance("v2x", v2x, V2X)
+    v2x = V2X() if v2x is None else instance("v2x", v2x, V2X)
     seed = seed_of(seed)
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))

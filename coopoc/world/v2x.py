@@ -12,7 +12,10 @@ Schedule = Literal["nearest", "round robin"]
 
 @dataclass(frozen=True)
 class V2X:
-    """Neighbourhood and channel. Neighbours are the nearest by true distance, as an on-board sensor would find them."""
+    """Neighbourhood and channel. Neighbours are the nearest by true distance, as an on-board sensor would find them.
+
+    By default every message comes at every step, at once, for free, as the paper's baselines assume.
+    """
 
     max_neighbours: int = 6
     """K: at most this many neighbours, nearest first."""
@@ -50,11 +53,6 @@ class V2X:
             "overhead": (0, 1e6, ">= 0 bytes"),
         }
         check_fields(self, limits)
-
-    @classmethod
-    def ideal(cls, max_neighbours: int = 6) -> "V2X":
-        """Every message at every step, at once, for free, as the paper's baselines assume."""
-        return cls(max_neighbours=max_neighbours)
 
     @classmethod
     def cam(cls, max_neighbours: int = 6) -> "V2X":
