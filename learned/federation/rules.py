@@ -125,36 +125,11 @@ class TrimmedMean(Rule):
         return weights.sort(0).values[cut : len(weights) - cut].mean(0)
 
 
-def krum_scores(weights: Tensor, byzantine: int) -> Tensor:
-    """(C,) sum of the squared distances of each client to its C - f - 2 nearest others, in float64.
-
-    Args:
-        weights: (C, P) weights.
-        byzantine: f, number of Byzantine clients that is tolerated.
-
-    Raises:
-        InputError: C <= 2 f + 2, for which there is no guarantee.
-
-    References:
-        Blanchard et al., Machine Learning with Adversaries, NeurIPS 2017, section 4.
-
-    >>> krum_scores(torch.tensor([[0.0], [1.0], [2.0], [3.0], [90.0]]), 1).tolist()
-    [5.0, 2.0, 2.0, 5.0, 15313.0]
-    """
-    count = len(weights)
-    if count <= 2 * byzantine + 2:
-        actual = f"{count} with byzantine = {byzantine}"
-        allowed = f"Krum needs more than 2 f + 2 = {2 * byzantine + 2} clients"
-        raise InputError("clients", actual, allowed, "Tolerate fewer Byzantine clients, or take the median.")
-    exact = weights.double()
-    square = torch.stack([(exact - one).square().sum(1) for one in exact])
-    nearest: Tensor = square.fill_diagonal_(torch.inf).sort(1).values[:, : count - byzantine - 2]
-    return nearest.sum(1)
-
-
 @dataclass(frozen=True)
 class Krum(Rule):
-    """Mean of the m clients with the lowest scores (`krum_scores`): Krum with m = 1, multi-Krum with more.
+    """Mean of the m clients with the lowest scores: Krum with m = 1, multi-Krum with more.
+
+    A score is the sum of the squared distances of a client to its C - f - 2 nearest others, in float64.
 
     Args:
         byzantine: f, number of Byzantine clients that is tolerated; needs C > 2 f + 2.
@@ -183,8 +158,15 @@ class Krum(Rule):
         return self.byzantine if clients >= self.least else 0
 
     def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
-        """Plain mean of the clients with the lowest scores; the first of equals."""
-        best = krum_scores(weights, self.byzantine).argsort(stable=True)[: self.keep or len(weights) - self.byzantine]
+        """Plain mean of the clients with the lowest scores; the first of equals.
+
+        >>> Krum().combine(torch.tensor([[0.0], [1.0], [2.0], [3.0], [90.0]]), torch.ones(5)).tolist()
+        [1.0]
+        """
+        exact, near = weights.double(), len(weights) - self.byzantine - 2
+        square = torch.stack([(exact - one).square().sum(1) for one in exact])
+        scores = square.fill_diagonal_(torch.inf).sort(1).values[:, :near].sum(1)
+        best = scores.argsort(stable=True)[: self.keep or len(weights) - self.byzantine]
         return weights[best.sort().values].mean(0)
 
 
