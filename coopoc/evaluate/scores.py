@@ -18,7 +18,6 @@ BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
     "sent_bytes_per_second": ("on air", "broadcast"),
     "payload_bytes_per_second": ("payload", "per receiver"),
-    "sent_payload_bytes_per_second": ("payload", "broadcast"),
 }
 """Columns of rows with the bytes of online cooperation, as a ledger counts them."""
 SLAB = 2**25
