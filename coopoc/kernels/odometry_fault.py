@@ -1,9 +1,12 @@
-"""Odometry that fails, as fixes show: wheels that stand still or run free, a compass that turns, a speed that freezes.
+"""Odometry that fails, as fixes show: wheels that stand still, a compass that turns, a speed that freezes, a current.
 
 Two filters follow a vehicle on the ground, beside the one that wants its motion. One believes the odometry, the other
 adds a velocity error b, a random walk. By how much likelier the second makes a fix is evidence, which adds up. Either
 begins anew at a fix that is far beyond it: a receiver that jumps, and stays displaced, moves as the odometry says. From
 DECISIVE on, if b is more than heading and scale err by, motions are corrected by b, until no evidence is left.
+
+This is done for each of two PACES of the random walk. The slow one finds errors of a tenth of the way, which last; the
+fast one those that begin and change at once, and are large.
 
 A receiver whose error grows steadily, by many of its deviations, looks the same to a vehicle that is alone.
 
@@ -26,75 +29,97 @@ LASTS, PATH, BEFORE, SPEED, FASTEST = 13, 14, 15, 17, 18
 of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
 fails, the evidence, for how long s and how far m there is some, and where odometry alone has led since m; squares of
 the most of late speeds and of all by odometry m^2/s^2."""
-WAY, SINCE, FIX, GAPS, TIMES, COUNT, BASE, RATIO, FLOOR, INTERVAL, SIZE = 19, 21, 22, 24, 26, 27, *range(28, 33)
+WAY, SINCE, FIX, GAPS, TIMES, COUNT, LIKELY, BASE, RATIO, FLOOR, INTERVAL = 19, 21, 22, 24, 26, 27, *range(28, 33)
 """Since then: the way by odometry m, the time s; the last fix m, sums of how far fixes were from the position and the
-way m, and of their times s, and how many there were; and, all the time, the numbers of a MotionNoise, base and
-ratio squared."""
+way m, and of their times s, and how many there were; the logarithm of how likely late fixes were; and, all the time,
+the numbers of a MotionNoise, base and ratio squared."""
+WALK, ANEW, SHARE, RATE, STDS, DURATION, SIZE = range(33, 40)
+PACES = ((0.001, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 0.2, 0.5, 5.0, 2.0))
+"""Of the random walks of b: the density of its acceleration m^2/s^3; the evidence that its filter loses where it begins
+anew; and the least error of an odometry that fails, as a share of the way, in m for each second, and in standard
+deviations of a fix, and for how many s it lasts."""
 TOGETHER = 0.4
 """s, interval whose fixes are averaged into one."""
-JERKY = 1.0
-"""m^2/s^3, density of the acceleration of b."""
 RESTART_Q, MAX_Q = 14.0, 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
 DECISIVE, MAX_EVIDENCE = 15.0, 18.0
 """Evidence, a log likelihood ratio, from which the odometry fails, and the most that is counted."""
-ERRS_SHARE, ERRS_RATE, ERRS_STDS, ERRS_SECONDS = 0.2, 0.5, 5.0, 2.0
-"""Least error of an odometry that fails, as a share of the way, in m for each second, and in standard deviations of a
-fix; and s for which it must last."""
 FASTER = 4.0
-"""Times the fastest by odometry that a vehicle may go, if that is above ERRS_RATE: m/s for km/h make it 3.6."""
+"""Times the fastest by odometry that a vehicle may go, if that is above RATE: m/s for km/h make it 3.6."""
 WANDERS = 2.0
 """s, in which the errors of all fixes may change together."""
 NOISIER, UNKNOWN = 0.1, 4.0
 """Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
 for at first, and that of odometry all the time."""
-SPEED_MEMORY = 10.0
-"""s, for which a speed is remembered."""
+SPEED_MEMORY, LIKELY_KEPT = 10.0, 0.9
+"""s, for which a speed is remembered; share of LIKELY that is left at the next fix."""
 
 
 def new_state(noise: MotionNoise) -> Floats:
-    """(SIZE,) before the first fix.
+    """(2, SIZE) before the first fix, one row for each pace.
 
     Args:
         noise: of the motion.
     """
-    state = np.full(SIZE, math.nan)
+    states = np.full((len(PACES), SIZE), math.nan)
     base, ratio = (float(np.square(std[:2]).mean()) for std in (noise.base, noise.ratio))
-    state[BASE:] = base, ratio, noise.floor, noise.interval
-    return state
+    for state, pace in zip(states, PACES, strict=True):
+        state[BASE:] = base, ratio, noise.floor, noise.interval, *pace
+    return states
 
 
 @part
-def correct(state: Floats, velocity: Floats, dt: float) -> float:
+def failing(states: Floats) -> int:
+    """Row of the pace that corrects: of those at which the odometry fails the likelier of late; -1 for none."""
+    likeliest = -1
+    for i in range(len(states)):
+        if states[i, FAILS] > 0.0 and (likeliest < 0 or states[i, LIKELY] > states[likeliest, LIKELY]):
+            likeliest = i
+    return likeliest
+
+
+@part
+def correct(states: Floats, velocity: Floats, dt: float) -> float:
     """Add b to a velocity (3,) m/s where the odometry fails, and return by how many m^2 its motion is more uncertain.
 
     Args:
-        state: of `new_state`, or of no length where odometry is believed.
+        states: of `new_state`, or of no length where odometry is believed.
         velocity: (3,) m/s.
         dt: s.
     """
-    if len(state) == 0 or math.isnan(state[PLACE]):
+    if len(states) == 0 or math.isnan(states[0, PLACE]):
         return 0.0
-    state[WAY] += dt * velocity[0]
-    state[WAY + 1] += dt * velocity[1]
-    state[SINCE] += dt
-    if state[FAILS] == 0.0:
+    for state in states:
+        state[WAY] += dt * velocity[0]
+        state[WAY + 1] += dt * velocity[1]
+        state[SINCE] += dt
+    i = failing(states)
+    if i < 0:
         return 0.0
+    state = states[i]
     velocity[0] += state[ERROR]
     velocity[1] += state[ERROR + 1]
     grown = dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2]
-    return float(2.0 * dt * state[VARIANCE + 1] + grown + JERKY * dt**3 / 3.0)
+    return float(2.0 * dt * state[VARIANCE + 1] + grown + state[WALK] * dt**3 / 3.0)
 
 
 @part
-def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
+def judge(states: Floats, x: float, y: float, r: float, dt: float) -> float:
     """Take a fix, m, NaN for none, whose axes have the variance r m^2; by how many m^2 the position is more uncertain
     than the odometry says if it has failed from now on."""
-    if len(state) == 0 or math.isnan(x):
+    if len(states) == 0 or math.isnan(x):
         return 0.0
+    before, gap2 = failing(states), 0.0
+    for state in states:
+        gap2 = max(gap2, judge_pace(state, x, y, r, dt))
+    return gap2 if before < 0 else 0.0
+
+
+@part
+def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
+    """The square, m^2, of the gap between both filters of a pace at a fix from which on the odometry fails, else 0."""
     if math.isnan(state[PLACE]):
-        for i in range(BASE):
-            state[i] = 0.0
+        state[:BASE] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE_UNTIL], state[LEVEL] = r, 1.0, r, UNKNOWN
         state[PLACE] = state[BELIEVED] = state[BEFORE] = state[FIX] = x
         state[PLACE + 1] = state[BELIEVED + 1] = state[BEFORE + 1] = state[FIX + 1] = y
@@ -115,11 +140,11 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
         return 0.0
     failed = state[FAILS] > 0.0
     gather_evidence(state, r / state[COUNT], dt)
-    if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < ERRS_SECONDS:
+    if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < state[DURATION]:
         return 0.0
     gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
-    least = max(ERRS_SHARE * state[PATH], ERRS_RATE * state[LASTS], ERRS_STDS * math.sqrt(r))
+    least = max(state[SHARE] * state[PATH], state[RATE] * state[LASTS], state[STDS] * math.sqrt(r))
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0
@@ -138,8 +163,8 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     q = state[BASE] + interval**2 * max(state[RATIO] * speed2, state[FLOOR] ** 2)
     q *= UNKNOWN * time / interval
     p, pb, bb = state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2]
-    p += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
-    pb, bb = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
+    p += 2.0 * time * pb + time * time * bb + state[WALK] * time**3 / 3.0 + q
+    pb, bb = pb + time * bb + 0.5 * state[WALK] * time * time, bb + state[WALK] * time
     sure = max(state[SURE_UNTIL] + q, r * time / WANDERS)
     s, wide = p + r, sure + r
     square = believed = 0.0
@@ -166,10 +191,12 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2] = share * r, (1.0 - share) * pb, bb
     state[SURE_UNTIL] = trust * r
     state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, MAX_Q) - 1.0)), 1.0)
+    state[LIKELY] = LIKELY_KEPT * state[LIKELY] - 0.5 * min(square, MAX_Q) - math.log(s)
     state[LASTS] += time
     state[PATH] += time * math.sqrt(speed2)
     more = 0.5 * (min(believed, MAX_Q) - min(square, MAX_Q)) + math.log(wide / s)
-    too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > ERRS_RATE**2
+    more -= state[ANEW] if anew else 0.0
+    too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > state[RATE] ** 2
     state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MAX_EVIDENCE)
     if state[EVIDENCE] == 0.0:
         state[FAILS] = state[PATH] = state[LASTS] = 0.0
@@ -199,18 +226,17 @@ def correct_drives(
         out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
             length only to ask.
     """
-    states, moved = np.empty((len(columns), SIZE)), np.empty(3)
+    states, moved = np.empty((len(columns), *fresh.shape)), np.empty(3)
     fails = False
     for run in range(gnss.shape[0]):
         for e in range(len(columns)):
-            for i in range(SIZE):
-                states[e, i] = fresh[i]
+            states[e] = fresh
         for t in range(gnss.shape[1]):
             for e in range(len(columns)):
                 n, extra, state = columns[e], 0.0, states[e]
                 moved[0], moved[1] = velocity[run, t, n, 0], velocity[run, t, n, 1]
                 if math.isnan(moved[0]):
-                    state[PLACE] = math.nan
+                    state[:, PLACE] = math.nan
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)

@@ -156,7 +156,7 @@ class StarStream:
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._answer: Floats = np.full(12, np.nan)
         self._memory: Floats = np.zeros(9)
-        self._odometry: Floats = new_state(self._motion) if priors.fix_gate else np.empty(0)
+        self._odometry: Floats = new_state(self._motion) if priors.fix_gate else np.empty((0, 0))
         if x0 is not None:
             self._memory[:6] = *self._start, *np.full(3, 1.0 / START_VARIANCE)
 

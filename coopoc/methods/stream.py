@@ -28,7 +28,7 @@ class FilterStream:
             np.zeros(8),
             np.hstack((*motion, *fixes)),
         )
-        self._odometry = new_state(motion) if fixes.gate > 0.0 else np.empty(0)
+        self._odometry = new_state(motion) if fixes.gate > 0.0 else np.empty((0, 0))
         if x0 is not None:
             self._state[:] = STATE
             self._state[:, 0] = three("x0", x0)

@@ -32,6 +32,7 @@ from coopoc.kernels.stars.cooperative_state import ACCELERATION, ESTABLISHED, MA
 from coopoc.kernels.stars.otherwise import (
     AGREEING,
     KNOWN,
+    LEFT_OPEN,
     MAX_LEVEL,
     MAX_LEVEL_CHANGE,
     MIN_LEVEL,
@@ -486,7 +487,8 @@ class Oracle:
             self.predict(dt * u, q)
             x = b.at("x", self.ego)
             across = min(SIDEWAYS + (TURNS * s.blind) ** 2, 1.0)
-            b.p[x, x] += slip * (across * np.eye(3) + np.outer(s.course, s.course))
+            widened = min(slip, LEFT_OPEN * self.grown) if self.corrected_now else slip
+            b.p[x, x] += widened * (across * np.eye(3) + np.outer(s.course, s.course))
         s.made = s.made + q.sum()
         grown, way = max(0.0 if self.ego in s.vague else self.own_variance() - s.whole, q.sum()), 0.0
         s.cov = s.cov + (grown / 3 if slip else q)

@@ -277,8 +277,9 @@ SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COU
 """Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, of the step's numbers
 the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, whether
 fixes have jumped; for how long s it has not measured its direction, and that; and the innovation of the last fix m."""
-SIDEWAYS, TURNS = 0.03, 0.3
-"""Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then."""
+SIDEWAYS, TURNS, LEFT_OPEN = 0.03, 0.3, 5.0
+"""Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then; and the
+most of that variance, in those of a motion as fixes correct it."""
 SLIP_LASTS, SLIP_INTERVAL, SPEED_MEMORY, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 """s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
 
@@ -373,13 +374,15 @@ def show(f: Filter) -> None:
 @part
 def slip(f: Filter, model: Model, own: Floats) -> None:
     """Widen the ego along its way, if this try assumes that it slips; a slip that begins now may have lasted for UNSEEN
-    s, by no more than fixes err and have shown."""
+    s, by no more than fixes err and have shown. Where fixes correct the motion, what they leave open is the most."""
     if f.ego[NOW] == 0.0:
         return
     rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
     variance = rate * own[DT] ** 2
     if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
         variance += min(rate * UNSEEN**2, sum(vector_at(own, FIX_VARIANCE // 3)) + f.ego[SHOWN] ** 2)
+    if f.ego[CORRECTED] > 0.0:
+        variance = min(variance, LEFT_OPEN * f.ego[CORRECTED])
     widen(f.g, 0, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
     for c in range(3):
         for d in range(3):
