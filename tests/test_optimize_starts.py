@@ -13,7 +13,8 @@ from coopoc.arrays import Floats
 from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Loss, Problem, Solution, solve, solve_gnc
 from coopoc.optimize.descent.levenberg_marquardt import arrive
-from coopoc.optimize.graph_problems import from_graph
+from coopoc.optimize.graph_problems import from_graph, loop_closures
+from coopoc.optimize.model.factor import taken
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
 from coopoc.optimize.starts.graph_starts import tree, walk
@@ -167,6 +168,17 @@ def test_rejecting_a_quarter_is_doubtful():
     z[:3] = 50.0
     problem = Problem(("a",)).add("position", ["a"] * 8, z + 1e-3 * np.arange(24).reshape(8, 3), std=1.0)
     assert solve_gnc(problem, [0]).notes[0].startswith("DOUBTFUL: GNC rejects 3 of 8 candidates")
+
+
+def test_a_loss_rejects_what_least_squares_need_not():
+    """No loop is beyond 2 where all count, but without one of them the cost is 7.23, not 8.36."""
+    problem = from_graph(random_graph(42, 2, 1, 15, landmarks=0, loops=8, ranges=0, seen=0), "geodesic")
+    (every,), [(_, loops)] = problem.factors, loop_closures(problem)
+    odometry, closing = (taken(every, rows) for rows in (np.setdiff1d(np.arange(len(every.nodes)), loops), loops))
+    found = solve(replace(problem, factors=(odometry, replace(closing, loss=Loss("truncated", 2.0)))))
+    for k in range(len(loops)):
+        rest = taken(closing, np.delete(np.arange(len(loops)), k))
+        assert found.cost <= (solve(replace(problem, factors=(odometry, rest))).cost + 2.0) * (1 + 1e-6)
 
 
 def test_small_drives_end_as_low_as_restarts_or_say_so():

@@ -15,7 +15,7 @@ from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
 from ..starts.mirrors import Cost, Descend, across, movable, scaled
-from ..starts.race import QUIET_DRAWS, doubts, drawn, reached_once, scattered
+from ..starts.race import QUIET_DRAWS, doubts, drawn, higher, reached_once, scattered
 from .candidates import Inner, Marked, mark
 
 MAX_ROUNDS = 300
@@ -138,8 +138,6 @@ def contest(
     x = inner(marked.problem.replace_unchecked(x0=frozen(start)))
     mu = surrogate.first(float((marked.squares(x) / marked.bound).max()))
     graduation = graduate(marked, surrogate, inner, x, mu)
-    if bool((graduation.weight == 1.0).all()):
-        return "graduated", finish(graduation.x), graduation, ()
     huber, cauchy, truncated = (softened(marked, name) for name in ("huber", "cauchy", "truncated"))
 
     with progress("robust") as counted:
@@ -157,6 +155,8 @@ def contest(
         ends = {name: landed(at) for name, at in starts.items()}
         costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
         best = min(ends, key=costs.__getitem__)
+        if bool((graduation.weight == 1.0).all()) and not higher(costs["graduated"], costs[best]):
+            return "graduated", ends["graduated"], graduation, ()
         loose = movable(cauchy)
         mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
         places = islice(_places(cauchy, mirrored_x, loose), QUIET_DRAWS)
