@@ -141,7 +141,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     x, iterations = result.x, result.iterations
     truth = assess(problem, x, covariance)
     status = Status.INFEASIBLE if result.infeasible else _status(problem, x, truth)
-    extras = result.extras | (search.extras if search.start else {})
+    extras = dict(result.extras)
+    if search.start:
+        extras |= {"start": search.start, "start_iterations": search.iterations, "start_seconds": search.seconds}
     if truth.active is not None and status is Status.INFEASIBLE:
         extras["violated"] = truth.active.violated
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):

@@ -23,17 +23,11 @@ from ..model.problem import Problem
 
 SETTINGS = {
     "scaling": 0,
-    "rho": 0.1,
     "alpha": 1.0,
-    "sigma": 1e-6,
     "eps_abs": 1e-9,
     "eps_rel": 1e-9,
-    "max_iter": 4000,
     "check_termination": 1,
-    "polishing": False,
     "polish_refine_iter": 10,
-    "adaptive_rho": 1,
-    "warm_starting": True,
     "verbose": False,
 }
 NEGLIGIBLE = 1e-11
@@ -83,15 +77,6 @@ def solver(
 
     end = arrive(system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, held)
     return SolverResult(end.x, end.iterations, extras=dict(programme.counts))
-
-
-def _pattern(layout: Layout) -> Any:
-    """The upper triangle of P (CSC) of a structure; ones on the diagonal."""
-    from scipy.sparse import csc_matrix
-
-    entries = layout.entries
-    identity = np.bincount(entries.diagonal, minlength=len(entries.indices))
-    return csc_matrix((identity.astype(np.float64), entries.indices, entries.indptr), shape=(entries.size,) * 2)
 
 
 class Infeasible(np.linalg.LinAlgError):
@@ -168,11 +153,13 @@ def _programme(problem: Problem, layout: Layout) -> Programme:
     """The programme of a problem with its constraints, which are linear."""
     from scipy.sparse import csc_matrix
 
-    matrix: Any = csc_matrix((0, layout.entries.size))
+    entries = layout.entries
+    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    matrix: Any = csc_matrix((0, entries.size))
     if problem.constraints:
         rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
-        matrix = csc_matrix(rows.matrix)[:, layout.entries.number.ravel() >= 0]
-    return Programme(_pattern(layout), matrix)
+        matrix = csc_matrix(rows.matrix)[:, entries.number.ravel() >= 0]
+    return Programme(pattern, matrix)
 
 
 def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:

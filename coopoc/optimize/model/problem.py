@@ -55,11 +55,6 @@ class Search(NamedTuple):
     notes: tuple[str, ...] = ()
     x0: Floats | None = None
 
-    @property
-    def extras(self) -> dict[str, str | int | float]:
-        """For `Solution.extras`."""
-        return {"start": self.start, "start_iterations": self.iterations, "start_seconds": self.seconds}
-
 
 @dataclass(frozen=True, eq=False)
 class Problem:
