@@ -5,7 +5,6 @@ index of a frame is the row in the file, from 1, so that an error names it whate
 """
 
 import csv
-import json
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -21,7 +20,7 @@ from coopoc.formats.values import MAX_NUMBER
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLES = (".csv", ".parquet", ".jsonl")
+TABLES = (".csv", ".parquet")
 WHOLE = re.compile(r"^(\d+)\.0$")
 """What a spreadsheet or pandas makes of a whole number beside empty cells: 7.0 is the name 7."""
 COLUMNS = 5000
@@ -48,11 +47,10 @@ LARGEST_TABLE = 2**27
 
 
 def read_frame(path: Path, *text: str) -> "pd.DataFrame":
-    """Table of a .parquet, .jsonl or (any other ending) CSV file.
+    """Table of a .parquet or (any other ending) CSV file.
 
     Args:
-        path: of the file; JSON with an object per line; CSV between commas, or between semicolons or tabs with decimal
-            commas.
+        path: of the file; CSV between commas, or between semicolons or tabs with decimal commas.
         text: columns of a CSV file that are kept as they are written: "007" stays "007".
 
     Raises:
@@ -60,9 +58,8 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    ending = path.suffix.lower()
     try:
-        if ending == ".parquet":
+        if path.suffix.lower() == ".parquet":
             from pyarrow.parquet import read_metadata
 
             size = read_metadata(path)  # a column of one value takes no room in the file
@@ -75,9 +72,6 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
                 )
             frame = pd.read_parquet(path)
             frame = frame.reset_index(drop=frame.index.name is None)
-        elif ending == ".jsonl":
-            lines = path.read_text("utf-8-sig").splitlines()
-            frame = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
         else:
             frame = _read_csv(path, text)
     except (InputError, ImportError):
@@ -97,9 +91,6 @@ def headers(path: Path) -> list[str]:
     try:
         if path.suffix.lower() == ".csv":
             return [name.strip() for name in _first_lines(path)[1]]
-        if path.suffix.lower() == ".jsonl":
-            with path.open(encoding="utf-8-sig") as file:
-                return list(json.loads(file.readline(100_000)))
         from pyarrow.parquet import read_schema
 
         return [str(name) for name in read_schema(path).names]

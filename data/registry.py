@@ -200,7 +200,7 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """
     kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix))
     if kind is None:
-        endings = ".csv, .parquet, .jsonl, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
+        endings = ".csv, .parquet, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
         raise InputError(
             "data",
             str(path),

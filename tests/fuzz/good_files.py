@@ -59,7 +59,6 @@ LOG = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(
     for k in range(8)
     for v in "ab"
 )
-JSONL = "".join(f'{{"t": {k / 10}, "vehicle": "a", "x": {0.8 * k}, "y": 1, "vx": 8, "vy": 0}}\n' for k in range(8))
 WIDE = "time,lat,lon,alt,speed,heading_deg,partner,range\n" + "".join(
     f"2024-05-01T10:00:0{k}Z,48.14{k},11.58,520,11.1,90,,\n" for k in range(8)
 )

@@ -65,7 +65,6 @@ READERS: Mapping[str, Reader] = {
     "mrclam": Reader(good.MRCLAM, load_fleet),
     "librsf": Reader(good.LIBRSF, lambda d: read_log(d, frame="body", any_scale=True)),
     "log": Reader({"log.csv": good.LOG}, lambda d: read_log(d / "log.csv", any_scale=True)),
-    "json log": Reader({"log.jsonl": good.JSONL}, lambda d: read_log(d / "log.jsonl")),
     "wide log": Reader({"car.csv": good.WIDE}, lambda d: read_log(d / "car.csv", columns=NAMES)),
     "nmea": Reader({"car.nmea": good.NMEA}, lambda d: read_log(d / "car.nmea")),
     "manifest": Reader({"manifest.json": good.MANIFEST}, _manifest),
