@@ -9,7 +9,7 @@ import pandas as pd
 import pymap3d
 
 from coopoc import InputError, Sensors
-from coopoc.arrays import Bools, Floats
+from coopoc.arrays import Bools, Floats, checked, refuse
 from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD
@@ -31,6 +31,8 @@ SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
 """m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
+DRIVES_APART = 3600.0
+"""s between two files of a folder beyond which they are of several drives, if it is also longer than all files."""
 LOCATING_FIXES, LEAPS = 10, 10.0
 """Fixes of a vehicle that show where it is; times its usual speed, to and from a fix that is none."""
 DISORDER_SHARE = 0.02
@@ -39,6 +41,12 @@ EQUAL_LOG_FACTOR = 0.1
 """Logarithm of a factor of deviations that is none."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
+
+
+def check_origin(origin: Origin) -> None:
+    """InputError unless it is latitude and longitude in degrees, and height in m."""
+    values, allowed = checked("origin", origin, "(3,)", (3,)), "must be degrees of latitude and longitude, and m"
+    refuse("origin", values, ~(np.abs(values) <= [90.0, 180.0, 1e6]), allowed, "Give origin=(48.14, 11.58, 520.0).")
 
 
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
@@ -82,6 +90,20 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
             'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.',
         )
     return rows
+
+
+def check_one_drive(rows: Rows, name: str) -> None:
+    """InputError for files of measurements that are too far apart in time to be of one drive."""
+    spans = rows[rows["true"] == 0].groupby("file", sort=False)["t"].agg(["min", "max"]).dropna().sort_values("min")
+    gaps = spans["min"] - spans["max"].cummax().shift()
+    covered = spans["max"].max() - spans["min"].min() - gaps.clip(lower=0.0).sum()
+    if (gaps > max(DRIVES_APART, covered)).any():
+        raise InputError(
+            name,
+            "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
+            f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
+            "Give each drive a folder of its own, and name that.",
+        )
 
 
 def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Origin | None]:

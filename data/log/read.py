@@ -11,7 +11,7 @@ import pandas as pd
 from scipy.interpolate import Akima1DInterpolator
 
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
-from coopoc.arrays import Floats, checked, instance, named, number, one_of, refuse, texts
+from coopoc.arrays import Floats, instance, named, number, one_of, texts
 from coopoc.errors import suggestion
 from coopoc.paths import given_path
 from coopoc.text import short_repr
@@ -37,7 +37,7 @@ from ..librsf import is_librsf, read_librsf
 from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
+from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
@@ -68,8 +68,6 @@ TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 SPARSE_SECONDS = 0.5
 """s between samples of a truth from which straight lines between them are not the path; within so many s of a sample
 the curve through all counts as truth."""
-DRIVES_APART = 3600.0
-"""s between two files of a folder beyond which they are of several drives, if it is also longer than all files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,14 +190,7 @@ def read_log(
         if value is not None:
             number(field, value, 1e-12, allowed="a number > 0 s", hint="Give seconds.")
     if origin is not None:
-        origin_array = checked("origin", origin, "(3,)", (3,))
-        refuse(
-            "origin",
-            origin_array,
-            ~(np.abs(origin_array) <= [90.0, 180.0, 1e6]),
-            "must be latitude and longitude in degrees, and height in m",
-            "Give origin=(48.14, 11.58, 520.0).",
-        )
+        check_origin(origin)
     options: dict[str, Any] = {
         "columns": named("columns", columns or {}, "Give columns={name: header}."),
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
@@ -220,7 +211,7 @@ def read_log(
     check_values(rows)
     for column in ("t", "arrival"):
         check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
-    _check_one_drive(rows, path)
+    check_one_drive(rows, path.name)
     if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     summary.rows = int((rows["true"] == 0).sum())
@@ -368,21 +359,6 @@ def _files(path: Path) -> list[Path]:
     bare = not any(_is_bag(file) or (file.parent == path and not TRUTH.fullmatch(file.stem)) for file in every)
     bare = bare and any(map(is_log, every))
     return sorted(file for file in every if bare or file.parent == path)
-
-
-def _check_one_drive(rows: Rows, path: Path) -> None:
-    """InputError for files of measurements that are too far apart in time to be of one drive."""
-    spans = rows[rows["true"] == 0].groupby("file", sort=False)["t"].agg(["min", "max"]).dropna().sort_values("min")
-    begins, ends = spans["min"].to_numpy(), np.maximum.accumulate(spans["max"].to_numpy())
-    gaps = begins[1:] - ends[:-1]
-    covered = ends[-1] - begins[0] - gaps.clip(0.0).sum() if len(spans) else 0.0
-    if (gaps > max(DRIVES_APART, covered)).any():
-        raise InputError(
-            path.name,
-            "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
-            f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
-            "Give each drive a folder of its own, and name that.",
-        )
 
 
 def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
