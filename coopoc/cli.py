@@ -152,7 +152,7 @@ def list_names() -> None:
             )
 
 
-OWN: Mapping[str, Command] = {
+OWN_COMMANDS: Mapping[str, Command] = {
     "run": run,
     "table": table,
     "report": report,
@@ -167,7 +167,7 @@ def _status(argv: list[str]) -> int:
         if argv[:1] in (["--version"], ["-V"]):
             print(version("coopoc"))
             return 0
-        status = _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
+        status = _dispatch({**plugins.points("coopoc.commands"), **OWN_COMMANDS}, argv, "coopoc")
         print(end="", flush=True)  # whether there is a stdout or not
         return status
     except ModuleNotFoundError as error:
@@ -232,7 +232,10 @@ def _settings(name: str) -> str:
 
 
 def _help(commands: Mapping[str, Command], prog: str) -> str:
-    order = [*(name for name in OWN if name in commands), *(name for name in commands if name not in OWN)]
+    order = [
+        *(name for name in OWN_COMMANDS if name in commands),
+        *(name for name in commands if name not in OWN_COMMANDS),
+    ]
     lines = "\n".join(f"  {name:<10} {_summary(commands[name])}" for name in order)
     return _ABOUT.format(commands=lines) if prog == "coopoc" else f"usage: {prog} COMMAND [options]\n\n{lines}"
 

@@ -26,7 +26,7 @@ position_covariance",
     "sensor_msgs/msg/Range": "range range min_range max_range",
 }
 """Type of a message -> what it is, and its fields that are read."""
-TRUTH = ("truth", "ground_truth", "groundtruth")
+TRUTH_TOPICS = ("truth", "ground_truth", "groundtruth")
 FIELDS = {
     "latitude": "latitude",
     "longitude": "longitude",
@@ -156,7 +156,7 @@ def _vehicles(kinds: Mapping[str, str], truth: str, bag: str) -> dict[str, tuple
     [('red', ''), ('blue', ''), ('red', '')]
     """
     parts = {topic: topic.strip("/").split("/") for topic in kinds}
-    true = {topic: topic == truth or any(part.lower() in TRUTH for part in of) for topic, of in parts.items()}
+    true = {topic: topic == truth or any(part.lower() in TRUTH_TOPICS for part in of) for topic, of in parts.items()}
     names = {}
     for topic, of in parts.items():
         kind = kinds[topic]

@@ -25,7 +25,7 @@ WHOLE = re.compile(r"^(\d+)\.0$")
 """What a spreadsheet or pandas makes of a whole number beside empty cells: 7.0 is the name 7."""
 COLUMNS = 5000
 """Most columns of a table."""
-USUAL = {
+USUAL_HEADERS = {
     "vehicle": "vehicle observer robot car agent sender vehicle_id robot_id id name",
     "partner": "partner neighbour neighbor to target subject other anchor receiver landmark",
     "t": "t time timestamp stamp seconds datetime utc tow sow",
@@ -218,7 +218,7 @@ def usual_key(header: str) -> str:
     """
     found = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
     parts = {header.lower(), *(word.lower() for word in found)}
-    return next((key for key, usual in USUAL.items() if not parts.isdisjoint(usual.split())), "")
+    return next((key for key, usual in USUAL_HEADERS.items() if not parts.isdisjoint(usual.split())), "")
 
 
 def missing_column(

@@ -10,7 +10,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError, said
 
 from .log.units import Rows, Summary, of_kinds
-from .nmea import MIN_COURSE_SPEED
+from .nmea import MIN_COG_SPEED_M_S
 
 PARTS = {
     ("processed_log/GNSS/live_gnss_ublox/value", "t"): "latitude longitude fast utc height compass_deg",
@@ -45,7 +45,7 @@ def read_segment(path: Path, summary: Summary) -> Rows:
             )
         tables.append(pd.DataFrame(table, columns=columns.split()).assign(t=t))
     fixes, _, true = tables
-    fixes.loc[fixes["fast"] < MIN_COURSE_SPEED, "compass_deg"] = np.nan
+    fixes.loc[fixes["fast"] < MIN_COG_SPEED_M_S, "compass_deg"] = np.nan
     summary.assume("the heading is the course that the receiver states while it moves")
     names = ("latitude", "longitude", "height")
     degrees = pymap3d.ecef2geodetic(*true[[*"xyz"]].to_numpy().T)

@@ -21,7 +21,7 @@ from .log.heading import Signal, step_means
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
-TURN = 2 * np.pi + 1e-6
+MAX_BEARING_RAD = 2 * np.pi + 1e-6
 LAGS = np.arange(0.0, 0.525, 0.025)
 """s, that are tried."""
 ERROR_SECONDS = 5.0
@@ -33,7 +33,7 @@ CALIBRATING_COUNT = 100
 """Measurements that a calibration takes."""
 ROBUST = 5.0
 """Robust standard deviations of an innovation beyond which it is an outlier."""
-PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8) 2011"
+DATASET_PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8) 2011"
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         position,
         backward_difference(t, position, ids),
         name=folder.name.lower(),
-        source=f"UTIAS MR.CLAM, Vicon truth, z = 0 ({PAPER})",
+        source=f"UTIAS MR.CLAM, Vicon truth, z = 0 ({DATASET_PAPER})",
         licence="none stated: read, not redistributed",
         heading=poses[..., 2],
     )
@@ -329,7 +329,7 @@ def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
         order = f"must {'increase' if strictly else 'not decrease'} in time from line to line"
         _refuse(file, gap <= 0 if strictly else gap < 0, order, "Mend or remove the stamp that is out of order.")
         angle = f"must have a {form.rpartition(' ')[2]} within a turn (a second), in rad"
-        _refuse(file, np.abs(table[:, -1]) > TURN, angle, "Convert degrees to radians.")
+        _refuse(file, np.abs(table[:, -1]) > MAX_BEARING_RAD, angle, "Convert degrees to radians.")
     return np.array(table)
 
 

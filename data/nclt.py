@@ -10,7 +10,7 @@ from coopoc.errors import InputError, MissingLibraryError, said
 
 from .log.units import Rows, Summary, of_kinds
 
-NAMES = ("train.pt", "val.pt", "test.pt")
+FILE_NAMES = ("train.pt", "val.pt", "test.pt")
 """Of its files."""
 FIELDS = {"filtered_gps": 2, "filtered_wheel": 2, "imu_sensor": 3, "theta_gt": 1, "ground_truth": 2}
 """Field of a drive, a row for each second -> columns that are read."""
@@ -18,7 +18,7 @@ FIELDS = {"filtered_gps": 2, "filtered_wheel": 2, "imu_sensor": 3, "theta_gt": 1
 
 def is_nclt(path: Path) -> bool:
     """Whether a file has the name of one of these."""
-    return path.name in NAMES
+    return path.name in FILE_NAMES
 
 
 def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:

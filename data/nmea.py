@@ -11,11 +11,12 @@ from coopoc import InputError, MissingLibraryError
 
 from .log.units import Rows, Summary, of_kinds
 
-KNOT, DAY = 1852 / 3600, 86400.0
+KNOT, DAY_S = 1852 / 3600, 86400.0
+"""m/s, and s."""
 LATITUDE, LONGITUDE = re.compile(r"\d\d[0-5]\d(\.\d*)?"), re.compile(r"\d{3}[0-5]\d(\.\d*)?")
 """Degrees and minutes: the parser takes the last digits before the point for minutes, however many there are."""
 FIX = "latitude", "longitude", "height"
-MIN_COURSE_SPEED = 0.5
+MIN_COG_SPEED_M_S = 0.5
 """m/s, below which a course over ground is noise."""
 
 
@@ -95,7 +96,7 @@ class _Sentences:
             return "velocities that the receiver calls invalid"
         else:
             row = {"speed": float(s.spd or 0.0) * KNOT}
-            if s.cog not in ("", None) and row["speed"] > MIN_COURSE_SPEED:
+            if s.cog not in ("", None) and row["speed"] > MIN_COG_SPEED_M_S:
                 row["compass_deg"] = float(s.cog)
         self.rows[number] = {"t": self.last, **row}
         return ""
@@ -103,8 +104,8 @@ class _Sentences:
     def _clock(self, time: Any, date: Any) -> None:
         seconds = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6
         if isinstance(date, datetime.date):
-            self.day = (date - datetime.date(1970, 1, 1)).days * DAY
+            self.day = (date - datetime.date(1970, 1, 1)).days * DAY_S
             self.first_day = self.first_day or self.day
-        elif self.day + seconds < self.last - DAY / 2:
-            self.day += DAY
+        elif self.day + seconds < self.last - DAY_S / 2:
+            self.day += DAY_S
         self.last = self.day + seconds

@@ -13,16 +13,13 @@ from coopoc.arrays import Floats, check_fields
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.methods.gaps import in_stretches
-from coopoc.methods.kalman import solo_track
+from coopoc.methods.kalman import known_start, solo_track
 from coopoc.methods.track import Alone, Track
 from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
 from .stream import GainStream
 from .training.machine import one_core
-
-SIZE = 3
-"""Components of a position."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,27 +71,19 @@ class LearnedGain(Alone):
         """Estimates of the egos, all runs at once; `notes` say where fixes contradict them."""
         began, columns = clock(), check_recording(recording).columns(egos)
         fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
-        origin, x0 = fixes[:, :1], self._x0(fixes[:, 0])
+        origin, first = fixes[:, :1], fixes[:, 0]
+        x0 = first if self.x0 is None else known_start(self.x0, first.shape)
         lanes = _lanes(fixes[:, 1:] - origin), _lanes(speeds[:, 1:]), _lanes(x0[:, None] - origin)[:, 0]
         with one_core(), torch.inference_mode():
             moved = self.model(*lanes, recording.dt).numpy().astype(np.float64)
-        moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, SIZE), 2, 1)
+        moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, 3), 2, 1)
         estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
         return solo_track(recording, columns, estimates, None, began)
 
-    def _x0(self, fixes: Floats) -> Floats:
-        """(R, E, 3) m, where the filter starts, of its first fixes."""
-        if self.x0 is None:
-            return fixes
-        if np.shape(self.x0) not in (fixes.shape, fixes.shape[1:]):
-            allowed = f"must be (R, E, 3) = {fixes.shape} or (E, 3)"
-            raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
-        return np.broadcast_to(self.x0, fixes.shape)
-
 
 def _lanes(array: Floats) -> Tensor:
     """(R E, T, 3) for the net of (R, T, E, 3)."""
-    flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], SIZE)
+    flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], 3)
     return torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32))

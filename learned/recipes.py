@@ -21,7 +21,7 @@ from .nets.gain import Gain
 from .training.clients import Client, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
-from .training.schedule import STEPS, Schedule
+from .training.schedule import COUNT_LIMITS, Schedule
 
 REVISION = 7
 """Raised whenever the training code changes what it makes of the same recipe."""
@@ -71,7 +71,7 @@ class Recipe:
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
+        check_fields(self, {"rounds": COUNT_LIMITS, "local_epochs": COUNT_LIMITS})
         if self.noise != STATIC:
             Outliers.named(self.noise)
         instance("options", self.options, tuple)

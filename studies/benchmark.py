@@ -22,7 +22,7 @@ from coopoc.paths import write
 from coopoc.plugins import find, in_file
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
-from coopoc.study.style import NOT_CAUSAL
+from coopoc.study.style import NOT_CAUSAL_SUFFIX
 from coopoc.workers import progress_bar
 
 from .convoys import CONVOYS, convoy_row
@@ -32,9 +32,9 @@ from .roads import PUBLISHED, ROADS, holds, road_row, roads
 from .tasks import LOGGED, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
 from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 
-NAMES = [task.name for task in TASKS]
+TASK_NAMES = [task.name for task in TASKS]
 """Of the simulated tasks."""
-USUAL = "cooperative-filter"
+COMPARED_WITH = "cooperative-filter"
 """Of which others are shown to be better or worse on the same blocks of real measurements."""
 
 
@@ -207,16 +207,16 @@ def page(cards: Iterable[Params]) -> str:
 
 def _logs(cards: Sequence[Params]) -> list[Row]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
-    each = [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] not in NAMES]
-    usual = {row["task"]: row for one, row in each if one == USUAL}
+    each = [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] not in TASK_NAMES]
+    usual = {row["task"]: row for one, row in each if one == COMPARED_WITH}
     rows = []
     for one, row in each:
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
             blocks, rival = row.get("blocks_m", ()), usual.get(row["task"], {}).get("blocks_m", "-")
-            if one != USUAL and len(blocks) == len(rival):
-                shown[f"less {USUAL} [m]"] = str(paired_difference(np.array(blocks), np.array(rival)))
+            if one != COMPARED_WITH and len(blocks) == len(rival):
+                shown[f"less {COMPARED_WITH} [m]"] = str(paired_difference(np.array(blocks), np.array(rival)))
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))
@@ -226,14 +226,14 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
 def _simulated(cards: Sequence[Params]) -> list[Row]:
     rows = []
     for one in cards:
-        cells = {row["task"]: row for row in one["tasks"] if row["task"] in NAMES}
+        cells = {row["task"]: row for row in one["tasks"] if row["task"] in TASK_NAMES}
         if not cells:
             continue
         errors = [row["rt_le_m"][0] for row in cells.values() if "rt_le_m" in row]
-        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(NAMES) else np.inf
+        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(TASK_NAMES) else np.inf
         paper = cells.get("paper", {})
         shown = {"method": one["method"], "mean": three(mean) if np.isfinite(mean) else "-"}
-        shown |= {task: _cell(cells[task]) if task in cells else "" for task in NAMES}
+        shown |= {task: _cell(cells[task]) if task in cells else "" for task in TASK_NAMES}
         shown |= {"NEES inside": paper.get("nees_inside", ""), "B/s": paper.get("received_bytes_per_second", "")}
         rows.append((mean, shown | {"us/step": paper.get("microseconds_per_step", "")}))
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
@@ -242,5 +242,5 @@ def _simulated(cards: Sequence[Params]) -> list[Row]:
 def _cell(row: Params) -> str:
     if "failed" in row:
         return "failed"
-    ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else NOT_CAUSAL * (row.get("information") == "")
+    ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else NOT_CAUSAL_SUFFIX * (row.get("information") == "")
     return f"{three(row['rt_le_m'][0])}{ratio}"

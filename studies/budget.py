@@ -32,18 +32,18 @@ MOST_NEIGHBOURS = NEIGHBOURS[-1]
 RATES = (1.0, 2.0, 5.0)
 CAPS = (100.0, 200.0, 400.0, 800.0)
 SCHEDULES = ("nearest", "round robin")
-FREE = {"rate_hz": None, "cap_bytes_per_second": None, "schedule": SCHEDULES[0]}
-AXES = ("channel", "max_neighbours", *FREE)
+IDEAL_CHANNEL = {"rate_hz": None, "cap_bytes_per_second": None, "schedule": SCHEDULES[0]}
+AXES = ("channel", "max_neighbours", *IDEAL_CHANNEL)
 """Parameters of a channel."""
-WORDS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cpm": "CPM, 5 Hz"}
+CHANNEL_LABELS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cpm": "CPM, 5 Hz"}
 PAYLOAD = "payload_bytes_per_second"
-LIMITS = (0.0, 300.0, 1000.0, 5000.0)
+BYTE_LIMITS = (0.0, 300.0, 1000.0, 5000.0)
 """B/s, under which the best method is named."""
 
 
 def over(channel: str, k: int, **limits: Any) -> dict[str, Any]:
     """A channel as parameters or as a selection; its own rate, no cap and the nearest first, but for the limits."""
-    return {"channel": channel, "max_neighbours": k, **FREE, **limits}
+    return {"channel": channel, "max_neighbours": k, **IDEAL_CHANNEL, **limits}
 
 
 def under(cap: float, schedule: str, method: str, noise_model: str) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def choices(results: Results) -> "pd.DataFrame":
 
 def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
-    for limit in LIMITS if len(each) else ():
+    for limit in BYTE_LIMITS if len(each) else ():
         if len(within := each[each[PAYLOAD] <= limit]):
             best = within.sort_values("rt_le_m", kind="stable").iloc[0]
             at = f", K = {best['max_neighbours']}, {best['schedule']}, {best[PAYLOAD]:.0f} B/s" if best[PAYLOAD] else ""
@@ -111,8 +111,8 @@ def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
     return None if rate is None else round(rate)
 
 
-METHODS = [
-    ((WORDS[name], look(pair[0]).label, pair[1]), of(*pair, **over(name, MOST_NEIGHBOURS)))
+METHOD_ROWS = [
+    ((CHANNEL_LABELS[name], look(pair[0]).label, pair[1]), of(*pair, **over(name, MOST_NEIGHBOURS)))
     for name in CHANNELS
     for pair in SHARED
 ]
@@ -127,7 +127,7 @@ STUDY = lineup.study(
     tables={
         "channels": selections(
             ("Channel", "Method", "Noise model"),
-            METHODS,
+            METHOD_ROWS,
             {"RT-LE [m]": mean, "Payload [B/s]": _rate, "On air [B/s]": partial(_rate, value="bytes_per_second")},
             f"K = {MOST_NEIGHBOURS} over field channels (CAM, BSM, CPM): rate, latency, bursts of loss, and what a "
             "message carries anyway. Payload is what a method adds.",

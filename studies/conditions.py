@@ -117,7 +117,7 @@ LATENCY_LOSS = study(
 )
 
 ERRORS = {
-    name: dict(zip(scene.LASTING, shares, strict=True))
+    name: dict(zip(scene.LASTING_SHARES, shares, strict=True))
     for name, shares in {
         "white": (0.0, 0.0),
         "half own": (0.5, 0.0),
@@ -129,20 +129,20 @@ ERRORS = {
 """Name -> shares of a fix's variance that are time-correlated: of each receiver, and common to all vehicles."""
 SOLO, SHARED = (("gnss", "none"), KALMAN, NET), (JOINT, SPLIT, COOPERATIVE, STAR, PAST)
 KS = {k: {"max_neighbours": k} for k in (0, 2, 6, 10)}
-LASTING = {f"{name}, K = {k}": {**shares, **at} for name, shares in ERRORS.items() for k, at in KS.items()}
+LASTING_CASES = {f"{name}, K = {k}": {**shares, **at} for name, shares in ERRORS.items() for k, at in KS.items()}
 CORRELATED_GNSS = study(
     "correlated_gnss",
     "What is cooperation worth when GNSS errors are time-correlated, so that no solo filter averages them out?",
-    LASTING,
+    LASTING_CASES,
     (*SOLO, *SHARED),
     "Lasting errors are 50 % or 90 % of a fix's variance, {drift_time_s:g} s correlated. All but the cooperative "
     "filter take them as white noise of the same variance. The bounds know how they last: of a star of newcomers "
     "without a past, and of messages which bring it along, as the cooperative filter's do.",
-    [title for title in LASTING if title.endswith("= 10")],
+    [title for title in LASTING_CASES if title.endswith("= 10")],
     rms,
     grid=[
         of(*pair, **case)
-        for case in LASTING.values()
+        for case in LASTING_CASES.values()
         for pair in (SHARED if case["max_neighbours"] else (*SOLO, COOPERATIVE, STAR))
     ],
     settings={**scene.TOWN, **scene.WEIGHTS, "drift_time_s": 60.0, "runs": 30, "train_seeds": 1},

@@ -10,10 +10,10 @@ import numpy as np
 from coopoc import V2X, Fleet, Method, Recording, observe
 from coopoc.arrays import AnyArray, Floats
 from coopoc.study.study import Row
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 
-from .pose_drives import hashed
-from .roads import BLOCK_SECONDS, ROADS, seen
+from .pose_drives import BLOCK_SECONDS, MIN_BLOCKS, hashed
+from .roads import ROADS, seen
 from .tasks import blocks_of, costs, located, planar, rounded
 
 CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
@@ -60,7 +60,9 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     gnss, velocity = (
         np.tile(each, (RUNS, 1, 1, 1)) for each in (_plane(true + error[rows]), _plane(ratio[rows] * driven) / dt)
     )
-    return replace(drawn, gnss=gnss, velocity=velocity, notes=(f"errors of fixes and odometry: {MEASURED}",)), fleet
+    return replace(
+        drawn, gnss=gnss, velocity=velocity, notes=(f"errors of fixes and odometry: {NOTHING_SIMULATED}",)
+    ), fleet
 
 
 def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
@@ -100,7 +102,7 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     method(recording.between(0, 3), egos)  # compiles
     track = method(recording, egos)
     gap, nees = planar(track, fleet)
-    size = min(BLOCK_SECONDS, len(recording.t) * recording.dt / 4) / recording.dt
+    size = min(BLOCK_SECONDS, len(recording.t) * recording.dt / MIN_BLOCKS) / recording.dt
     blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
     row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}

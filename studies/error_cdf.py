@@ -15,7 +15,7 @@ from .views import FigureView, TableView, curves, of, selections
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
 CLASSIC = (("gnss", "none"), ("kalman", "identity"), ("kalman", "fitted"), ("kalman", "nominal"), ("kalman", "oracle"))
-LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER))
+LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER_METHODS))
 DRAWN = [pair for pair in LINEUP if pair[1] != "nominal" and pair[0] not in weights.INDIVIDUAL[1:]]
 SHARES = (0.05, *np.linspace(0.1, 0.9, 9).tolist(), 0.95, 0.99)
 """Of the time steps, at which the distributions are drawn."""

@@ -13,7 +13,7 @@ from coopoc.errors import unknown
 from coopoc.paths import given_path
 from coopoc.plugins import called, find, in_file, names
 from coopoc.study.study import Params, Row
-from coopoc.study.style import NOT_CAUSAL
+from coopoc.study.style import NOT_CAUSAL_SUFFIX
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
@@ -178,7 +178,7 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
         columns = scored(method, recording, who, drive, quantiles, metric)
         more: Row = {} if seed is None else {"train_seed": seed}
         if strange:
-            more["label"] = method.name + ("" if causal(method, recording, who) else NOT_CAUSAL)
+            more["label"] = method.name + ("" if causal(method, recording, who) else NOT_CAUSAL_SUFFIX)
         table += rows_of(columns, who, **more)
     return table
 

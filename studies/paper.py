@@ -13,7 +13,7 @@ from coopoc.plugins import find
 if TYPE_CHECKING:
     from coopoc import Results
 
-PAPER: Mapping[str, tuple[str, ...]] = {
+PAPER_STUDIES: Mapping[str, tuple[str, ...]] = {
     "convergence": ("centralised",),
     "error_cdf": ("scenario 1", "scenario 2"),
     "neighbours": ("nominal",),
@@ -41,16 +41,16 @@ def paper(
     from coopoc.study.report import report
 
     began, results, inputs = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}
-    for number, name in enumerate(PAPER, start=1):
-        print(f"coopoc: stage {number} of {len(PAPER) + 1}: {name}", file=sys.stderr)
+    for number, name in enumerate(PAPER_STUDIES, start=1):
+        print(f"coopoc: stage {number} of {len(PAPER_STUDIES) + 1}: {name}", file=sys.stderr)
         study = find("coopoc.studies", name)
         results[name] = run_study(study, out=out, jobs=jobs, settings=inputs, retry_failed=True)
-    print(f"coopoc: stage {len(PAPER) + 1} of {len(PAPER) + 1}: report", file=sys.stderr)
-    texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
+    print(f"coopoc: stage {len(PAPER_STUDIES) + 1} of {len(PAPER_STUDIES) + 1}: report", file=sys.stderr)
+    texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER_STUDIES.items()}
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
     chosen = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
     page = report(
-        [out / name for name in PAPER],
+        [out / name for name in PAPER_STUDIES],
         out / "report.html",
         title="Should vehicles collaborate while they train, or while they decide?",
         lead=[reported("neighbours", results["neighbours"], ["answer"]), LEAD.format(where=chosen)],

@@ -1,6 +1,7 @@
 """Real drives whose headings are estimated: measurements, first poses, truth, and the part that is scored."""
 
 import hashlib
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
@@ -10,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Links, Recording, pose_start
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, number
 from coopoc.data.fetch import bring
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
-from coopoc.data.log.residuals import begin_of, together
+from coopoc.data.log.residuals import GATE_STDS, begin_of, together
 from coopoc.data.mrclam import calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, read_log
 from coopoc.data.source import split
@@ -22,9 +23,10 @@ from coopoc.study.study import Params
 from coopoc.world.storage import digest
 
 LONGEST_CALIBRATION, CALIBRATION_SHARE = 300.0, 0.4
-"""s, and share of the drive, that calibrate where the settings leave it open."""
+"""s at most, and share of the drive, that calibrate and train where the settings leave it open."""
 BLOCK_SECONDS, MIN_BLOCKS = 30.0, 4
-"""s of a block of time, and the least number of blocks, where the settings leave it open."""
+"""s of a block of time, over which errors are averaged, and the least number of blocks, where the settings leave it
+open."""
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
@@ -34,8 +36,6 @@ POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
 }
 """Pose filters by name: their options."""
-GATE_STDS = 5.0
-"""Standard deviations, of all pose filters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,14 +155,9 @@ def calibrated(p: Params) -> float:
     Raises:
         InputError: nothing is left to be scored.
     """
-    seconds = source(p["data"]).seconds
-    until = (
-        min(LONGEST_CALIBRATION, CALIBRATION_SHARE * seconds) if p["calibrate_s"] is None else float(p["calibrate_s"])
-    )
-    if not 0 <= until < seconds:
-        allowed = f"must be 0 or more and end before the drive, {seconds:g} s"
-        raise InputError("calibrate_s", f"{until:g} s", allowed, "Leave a part to score.")
-    return until
+    length = source(p["data"]).seconds
+    usual, hint = min(LONGEST_CALIBRATION, CALIBRATION_SHARE * length), f"Leave a part of the {length:g} s to score."
+    return _set(p, "calibrate_s", usual, np.nextafter(length, 0.0), hint)
 
 
 def left(p: Params) -> float:
@@ -172,7 +167,17 @@ def left(p: Params) -> float:
 
 def block(p: Params) -> float:
     """s of a block of time, which errors are averaged over: set, else 30 s, a quarter of the rest at most."""
-    return min(BLOCK_SECONDS, left(p) / MIN_BLOCKS) if p["block_s"] is None else float(p["block_s"])
+    return _set(p, "block_s", min(BLOCK_SECONDS, left(p) / MIN_BLOCKS))
+
+
+def driven(p: Params) -> float:
+    """s of the drive that the bytes are for: set, else the part that is scored."""
+    return _set(p, "drive_s", left(p))
+
+
+def _set(p: Params, name: str, usual: float, most: float = sys.float_info.max, hint: str = "Give seconds.") -> float:
+    """A setting in s, or what is usual where there is none; InputError unless it is in 0..most."""
+    return float(number(name, usual if p[name] is None else p[name], 0.0, most, hint=hint))
 
 
 def hashed(*paths: Path) -> str:

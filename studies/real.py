@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, Study, Track, heading_error, pose_nees
-from coopoc.arrays import Floats, one_of
+from coopoc.arrays import Floats, number, one_of
+from coopoc.data.log.residuals import GATE_STDS
 from coopoc.data.source import split
 from coopoc.evaluate.metrics import errors, fix_innovations
 from coopoc.evaluate.scores import online_columns
@@ -23,16 +24,16 @@ from .pose_drives import Drive, thinned
 from .scene import CODE
 from .views import Plot
 
-FLEET, *DECENTRALISED = METHODS = ("pose-fleet", "pose-intersection", "pose-naive")
+FLEET, *DECENTRALISED = FLEET_METHODS = ("pose-fleet", "pose-intersection", "pose-naive")
 """Pose filters of a fleet in body frames."""
 ALONE, FEDERATED, CENTRAL = TRAINED = ("trained-alone", "trained-federated", "trained-centralised")
 """One state or a solo filter whose constants are learned on the first part: from a vehicle's own measurements, as the
 mean of the logarithms of all vehicles, from all measurements at once."""
 BASE = {"method": FLEET}
 """The filter that is run with neighbours and without, with the noise as it is assumed."""
-EVERY = (*METHODS, *TRAINED)
+EVERY = (*FLEET_METHODS, *TRAINED)
 LANDMARKS, NEIGHBOURS = (0, 1, 2, 4, 15), (0, 1, 2, 3, 4)
-TRAINING, UNTIL_THINNED = (1, 4, 15), 30.0
+TRAINING_LANDMARKS, UNTIL_THINNED = (1, 4, 15), 30.0
 """Landmarks of the drives that noise is learned on, and s until they are thinned, a tenth of that part at most."""
 
 
@@ -53,7 +54,7 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
         tasks = []
         for k in dict.fromkeys(ends):
             drive = source.drive(until, near(k))
-            for landmarks in dict.fromkeys(min(n, source.landmarks) for n in TRAINING):
+            for landmarks in dict.fromkeys(min(n, source.landmarks) for n in TRAINING_LANDMARKS):
                 part = thinned(drive.recording, landmarks, settled).between(0, steps)
                 tasks.append(PoseTask(part, truth, egos, _filter(FLEET, k, drive), settled))
         return fit_pose_noise(tasks, first.sensors, evaluations)
@@ -80,12 +81,13 @@ def key(p: Params) -> dict[str, str]:
     """Digests of the code and of the measurements.
 
     Raises:
-        InputError: data or a part to calibrate on that cannot be used, an unknown method.
+        InputError: data or a setting that cannot be used, an unknown method.
     """
     one_of("method", p["method"], EVERY)
     source = drives.source(p["data"])
     source.check(drives.calibrated(p))
-    channel(p)
+    channel(p), drives.block(p), drives.driven(p)
+    number("landmarks", p["landmarks"], kind=int, allowed=">= 0")
     return {"code": revision(*CODE), **source.digests}
 
 
@@ -123,18 +125,13 @@ def cell(p: Params) -> list[Row]:
         scores = _scores(track, recording, drive.truth)
         finite = np.isfinite(next(iter(scores.values()), np.empty((0, len(who)))))[start : start + blocks * block]
         for ego, name in enumerate(who):  # as many blocks for each vehicle, of the steps at which it can be scored
-            for number, scored in enumerate(np.array_split(start + np.flatnonzero(finite[:, ego]), blocks)):
+            for run, scored in enumerate(np.array_split(start + np.flatnonzero(finite[:, ego]), blocks)):
                 columns = {what: _reduced(what, score[scored, ego]) for what, score in scores.items()}
                 if any(np.isfinite(value) for value in columns.values()):
                     columns["bytes_per_second"] = online["bytes_per_second"][0, ego]
-                    columns["sent_bytes"] = once + online["sent_bytes_per_second"][0, ego] * driven(p)
-                    rows.append({"run": number, "ego": name, **columns})
+                    columns["sent_bytes"] = once + online["sent_bytes_per_second"][0, ego] * drives.driven(p)
+                    rows.append({"run": run, "ego": name, **columns})
     return rows
-
-
-def driven(p: Params) -> float:
-    """s of the drive that the bytes are for: set, else the part that is scored."""
-    return drives.left(p) if p["drive_s"] is None else float(p["drive_s"])
 
 
 def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
@@ -148,7 +145,7 @@ def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
 
 def _filter(name: str, k: int, drive: Drive) -> PoseFilter:
     options = drives.POSES[name if k else "pose-solo"]
-    return PoseFilter(**options, lasting=drive.lasting, gate=drives.GATE_STDS, begin=drive.begin, spread=drive.spread)
+    return PoseFilter(**options, lasting=drive.lasting, gate=GATE_STDS, begin=drive.begin, spread=drive.spread)
 
 
 def _scores(track: Track, recording: Recording, truth: Fleet | None) -> dict[str, Floats]:
@@ -208,7 +205,7 @@ def _table(results: Results, value: str, text: str, **options: Any) -> Table | N
     if present(results, {}, value) is None:
         return None
     numbers = across(partial(interval, value=value), _columns(results))
-    texts = f"{text} {BYTES.format(driven(results.settings))}"
+    texts = f"{text} {BYTES.format(drives.driven(results.settings))}"
     columns = {"Sent [B]": _sent, **numbers}
     return crossed(
         results, HEAD, _rows(results), columns, _caption(results, texts), notes=unused(results, True), **options
@@ -273,7 +270,7 @@ def _trade(results: Results) -> "Plot | None":
         for k, (label, color, mark) in enumerate(looks)
     ]
     text = f"RT-LE against the bytes that a vehicle sends; what sends none is at the left. {BYTES}"
-    caption = _caption(results, text.format(driven(results.settings)))
+    caption = _caption(results, text.format(drives.driven(results.settings)))
     return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 

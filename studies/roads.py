@@ -12,14 +12,11 @@ from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.source import split
 from coopoc.study.study import Row
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 
-from .pose_drives import hashed
+from .pose_drives import BLOCK_SECONDS, CALIBRATION_SHARE, MIN_BLOCKS, hashed
 from .tasks import blocks_of, located, planar, rounded
 
-BEGIN_SHARE, BLOCK_SECONDS = 0.4, 30.0
-"""Share of a drive before what is scored, free for training; s of a block, a quarter of the rest at most, over which
-errors are averaged."""
 FIX_EVERY, OUTAGE_SECONDS, PERIOD_SECONDS = 10, 30.0, 180.0
 """One fix in so many is kept, and none in the last s of every period of s."""
 ROADS: Mapping[str, tuple[str, ...]] = {
@@ -92,7 +89,7 @@ def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
     measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
     fleet = Fleet(("car",), 0.1037 * np.arange(len(truth)), ways[1], motion, name="KITTI 00")
     drawn = observe(fleet, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)
-    return replace(drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {MEASURED}",)), fleet
+    return replace(drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {NOTHING_SIMULATED}",)), fleet
 
 
 def road_row(task: str, data: Path | None, made: Method) -> Row:
@@ -104,7 +101,7 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
         made: a method.
     """
     recording, truth = seen(task, data)
-    start, column = int(BEGIN_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
+    start, column = int(CALIBRATION_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
     files = [located(data, name) for name in roads(data)[task]]
@@ -117,7 +114,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
     """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
     vehicle, NEES of (x, y), us of a step."""
     blocks, ratios, seconds, axis = list[float](), list[Floats](), 0.0, dict[str, float]()
-    size = min(BLOCK_SECONDS / recording.dt, (len(recording.t) - start) / 4)
+    size = min(BLOCK_SECONDS / recording.dt, (len(recording.t) - start) / MIN_BLOCKS)
     for column in recording.observers:
         squares = np.full(len(recording.t), np.nan)
         for begin, stop in recording.stretches(column):

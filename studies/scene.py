@@ -117,7 +117,7 @@ def _there(data: str) -> Bools:
     return there if log.truth is None else np.asarray(there & log.truth.present)
 
 
-LASTING = ("own_share", "common_share")
+LASTING_SHARES = ("own_share", "common_share")
 """Parameters: shares of a fix's variance that are time-correlated, of each receiver and common to all."""
 
 
@@ -126,7 +126,7 @@ def sensors(p: Params) -> Sensors:
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
-    noise = lasting(presets[p["scenario"]](), *(p.get(name, 0.0) for name in LASTING))
+    noise = lasting(presets[p["scenario"]](), *(p.get(name, 0.0) for name in LASTING_SHARES))
     return replace(
         noise,
         velocity_std_ratio=p["velocity_ratio"],
@@ -145,7 +145,9 @@ def lasting(noise: Sensors, own: float, common: float) -> Sensors:
     0.9
     """
     if not (own >= 0 and common >= 0 and own + common < 1):
-        raise InputError(", ".join(LASTING), (own, common), "must be >= 0 and below 1 together", "0.5 is half of it.")
+        raise InputError(
+            ", ".join(LASTING_SHARES), (own, common), "must be >= 0 and below 1 together", "0.5 is half of it."
+        )
     white, drift, shared = (noise.gnss_std[0] * float(np.sqrt(share)) for share in (1.0 - own - common, own, common))
     return replace(noise, gnss_std=(white,) * 3, gnss_drift_std=drift, gnss_common_std=shared)
 
@@ -193,9 +195,17 @@ def conditions(p: Params) -> str:
     return f"{heading(p)}{labels}; {size}{trained}."
 
 
-SIMULATED = ("scenario", "velocity_ratio", "drift_time_s", "heading_std_deg", "heading_bias_deg", "outliers", *LASTING)
+SIMULATED = (
+    "scenario",
+    "velocity_ratio",
+    "drift_time_s",
+    "heading_std_deg",
+    "heading_bias_deg",
+    "outliers",
+    *LASTING_SHARES,
+)
 """Settings of simulated noise, which a log has of its own."""
-TRAINING = ("clients", "weights", "train_seeds", "velocity_reading")
+TRAINING_SETTINGS = ("clients", "weights", "train_seeds", "velocity_reading")
 
 
 def idle(results: "Results") -> set[str]:
@@ -206,7 +216,7 @@ def idle(results: "Results") -> set[str]:
     off = {n for n, value in p.items() if value in ("", None)} | zeros
     trained = {"trained", "fitted"} & {*results.frame.get("noise_model", ["trained"])}
     drawn = ("seed", "runs", *SIMULATED) if is_real(p["data"]) else ()
-    return off | set(drawn) | set(() if trained else TRAINING)
+    return off | set(drawn) | set(() if trained else TRAINING_SETTINGS)
 
 
 def caption(results: "Results", *texts: str, **at: Any) -> str:

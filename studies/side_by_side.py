@@ -9,7 +9,7 @@ from coopoc.study.tables import Table, smooths
 from . import lineup, scene
 from .views import Plot, TableView, of, table
 
-METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-filter", "bound")
+DEFAULT_METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-filter", "bound")
 CONDITIONS: dict[str, Any] = {
     "channel": "ideal",
     "rate_hz": None,
@@ -94,7 +94,7 @@ def _findings(results: Results) -> dict[str, str]:
 STUDY = lineup.study(
     "side_by_side",
     "How do these methods compare with each other and with the bound?",
-    grid={"max_neighbours": (0, 2, 6), "method": METHODS, "noise_model": ("nominal",)},
+    grid={"max_neighbours": (0, 2, 6), "method": DEFAULT_METHODS, "noise_model": ("nominal",)},
     settings={**scene.TOWN, "radius_m": None, **scene.WEIGHTS, **CONDITIONS, "runs": 10, "train_seeds": 1},
     reference=None,
     shares=("max_neighbours",),

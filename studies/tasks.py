@@ -30,6 +30,7 @@ from coopoc import (
 )
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring, cache_folder, holder, public
+from coopoc.data.log.residuals import GATE_STDS
 from coopoc.evaluate.metrics import errors
 from coopoc.evaluate.scores import online_columns
 from coopoc.evaluate.statistics import mean_interval
@@ -37,7 +38,7 @@ from coopoc.study.study import Row
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
-from .pose_drives import GATE_STDS, POSES, hashed
+from .pose_drives import POSES, hashed
 
 VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
@@ -77,20 +78,20 @@ class Task:
 WHITE = Sensors.paper_scenario2()
 IDEAL = V2X(max_neighbours=6)
 CAM = replace(V2X.cam(6), latency=0.1, loss=0.3)
-HEADING = replace(WHITE, heading_std=float(np.deg2rad(2)), heading_bias_std=float(np.deg2rad(3)))
-LASTING = replace(WHITE, gnss_std=(1.5, 1.5, 1.5), gnss_drift_std=2.5, gnss_common_std=1.5)
+BIASED_COMPASS = replace(WHITE, heading_std=float(np.deg2rad(2)), heading_bias_std=float(np.deg2rad(3)))
+LASTING_ERRORS = replace(WHITE, gnss_std=(1.5, 1.5, 1.5), gnss_drift_std=2.5, gnss_common_std=1.5)
 LONG_RANGES = Outliers(ranges=Fault(0.05, (3.0, 20.0)))
 MISTAKEN = replace(WHITE, outliers=replace(LONG_RANGES, angles=Fault(0.01)))
 CANYON = replace(WHITE, outliers=Outliers.urban_canyon())
-STORM = replace(HEADING, outliers=LONG_RANGES)
+STORM = replace(BIASED_COMPASS, outliers=LONG_RANGES)
 FIFTH, LATER = Spoofing(0.2), Spoofing(0.2, start=30.0)
 TASKS = (
     Task("alone", "town10", Sensors.paper_scenario1(), V2X(0)),
     Task("paper", "town10", WHITE, IDEAL),
     Task("elsewhere", "town04", WHITE, IDEAL),
-    Task("lasting", "town10", LASTING, IDEAL),
+    Task("lasting", "town10", LASTING_ERRORS, IDEAL),
     Task("field", "town10", WHITE, CAM),
-    Task("heading", "town10", HEADING, IDEAL),
+    Task("heading", "town10", BIASED_COMPASS, IDEAL),
     Task("outliers", "town10", MISTAKEN, IDEAL),
     Task("canyon", "town10", CANYON, IDEAL),
     Task("spoofed", "town10", WHITE, IDEAL, FIFTH),

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
-PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
+PAPER_METHODS = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
-LEARNED = (*PAPER, "fedokf")
+LEARNED = (*PAPER_METHODS, "fedokf")
 """Methods that are trained."""
 WORST_RATIO = 1.1
 """Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""

@@ -14,7 +14,7 @@ from scipy import special
 
 from coopoc import InputError, Method, nees, rt_le
 from coopoc.arrays import number
-from coopoc.evaluate.statistics import mean_interval
+from coopoc.evaluate.statistics import WORSE_RATIO, mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.paths import made_folder, write
 from coopoc.plugins import file_digest, in_file
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 JOINT, ALONE = "joint", "kalman"
 """What a method is compared with on the same draws: the textbook filter, and being alone."""
-WORSE_RATIO = 1.1
-"""Ratio of errors from which on a method is worse."""
 BAND = special.chdtri(3, [0.975, 0.025])
 """In which 95 % of the NEES of a consistent filter are, of three degrees of freedom."""
 MIN_RATIO = 1e-9

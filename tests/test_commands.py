@@ -18,7 +18,7 @@ from shell import ROOT, TUTORIALS, python
 
 import coopoc as co
 from coopoc import plugins
-from coopoc.cli import OWN, _status
+from coopoc.cli import OWN_COMMANDS, _status
 from coopoc.data.fetch import public
 from coopoc.study.cell import assignments
 
@@ -51,7 +51,7 @@ def words(line: str) -> list[str]:
 
 def parsed(argv: list[str]) -> tuple[str, dict[str, Any]]:
     """The command of the words, and the arguments that tyro makes of the rest; nothing is called."""
-    known: Mapping[str, Any] = {**plugins.points("coopoc.commands"), **OWN}
+    known: Mapping[str, Any] = {**plugins.points("coopoc.commands"), **OWN_COMMANDS}
     names = []
     while True:
         names.append(argv[0])

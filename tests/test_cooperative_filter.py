@@ -23,7 +23,7 @@ from coopoc.studies.world_faults import delayed
 from coopoc.studies.worlds import world
 from coopoc.world.inbox import inbox
 from coopoc.world.links import wrap
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 from coopoc.world.spoofing import Spoofing, spoofed
 
 S2 = Sensors.paper_scenario2()
@@ -333,7 +333,7 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
     "failing": (replace(S2, gnss_std=(0.5,) * 3), CHANNELS["late"], failing),
     "tunnel": (S2, CHANNELS["late"], tunnel),
     "lost": (S2, V2X(6, loss=0.3), lambda r: r),
-    "measured": (S2, V2X(6, loss=0.1, latency=0.1), lambda r: replace(r, notes=(f"fixes: {MEASURED}",))),
+    "measured": (S2, V2X(6, loss=0.1, latency=0.1), lambda r: replace(r, notes=(f"fixes: {NOTHING_SIMULATED}",))),
     "alone": (S2, CHANNELS["alone"], lambda r: r),
     "displaced": (replace(S2, gnss_std=(0.1,) * 3), CHANNELS["alone"], displaced),
     "displaced, late": (replace(S2, gnss_std=(0.1,) * 3), CHANNELS["late"], displaced),

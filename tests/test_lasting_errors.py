@@ -11,7 +11,7 @@ import coopoc as co
 from coopoc import V2X, CooperativeFilter, Fleet, Recording, observe
 from coopoc.methods.cooperative_filter import ON_ROADS, Priors
 from coopoc.world.body_frames import turned
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 
 S2 = co.Sensors.paper_scenario2()
 ONLY_SCALE = Priors(forget=0.0, heading=0.0, slip=0.0, lasts=1e12)
@@ -100,7 +100,7 @@ def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town, factor,
     sensors = replace(S2, range_offset_std=0.3)
     acts = replace(sensors, gnss_std=tuple(factor * np.array(S2.gnss_std)))
     seen = observe(town, acts, V2X(4), runs=2, observers=[3], assumed=sensors)
-    notes = CooperativeFilter()(replace(seen, notes=(MEASURED,)), [3]).notes
+    notes = CooperativeFilter()(replace(seen, notes=(NOTHING_SIMULATED,)), [3]).notes
     levels = [float(note.split()[-5]) for note in notes if note.startswith(f"fix level, {town.ids[3]}: ")]
     assert levels == (pytest.approx([factor], rel=0.15) if said else [])
     assert not any(note.startswith("range offset, ") for note in notes)
@@ -110,7 +110,7 @@ def test_a_fleet_speaks_for_odometries_that_do_not_err():
     """Five precise odometries, fixes of 1 Hz, 90 s: what is known of all counts, and where all err, nothing is lost."""
     town = co.load_fleet("town10").between(0, 900)
     precise = replace(S2, velocity_std_ratio=0.01)
-    seen = replace(observe(town, precise, V2X(4), runs=3, observers=[3, 8]), notes=(MEASURED,))
+    seen = replace(observe(town, precise, V2X(4), runs=3, observers=[3, 8]), notes=(NOTHING_SIMULATED,))
     seen = replace(seen, gnss=np.where(np.arange(900)[:, None, None] % 10, np.nan, seen.gnss))
     wrong = erring(seen)
     each, none = ON_ROADS._replace(exact=-np.inf), ON_ROADS._replace(heading=0.0, scale=0.0)

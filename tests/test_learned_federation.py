@@ -137,8 +137,9 @@ def test_a_client_that_never_answered_does_not_choose_the_weights(four):
 def test_absent_clients_count_with_their_last_answer(four):
     fed = trained(four, 4, participation=Participation(0.5), seed=1)
     assert torch.equal(flatten([fed.after(1)])[0], fed.history[1].weights)
-    with refused("round = 5"):
-        fed.after(5)
+    for rounds in (5, 0.5):
+        with refused(f"rounds = {rounds}"):
+            fed.after(rounds)
     for before, row in zip(fed.history, fed.history[1:], strict=False):
         for i, name in enumerate(fed.names):
             assert (row.validation_loss[i] == before.validation_loss[i]) == (name in row.absent)

@@ -11,7 +11,7 @@ from coopoc.evaluate.metrics import errors, nees, nees_inside
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.methods.cooperative_filter import Priors
 from coopoc.methods.noise_model import resolve
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
@@ -101,7 +101,7 @@ def test_noise_fitted_to_a_log_is_kept_where_it_helps_on_a_third_held_out(lasts,
     for drive in (formation, formation.select(formation.ids[::-1])):  # whichever vehicle is the first
         seen = observe(drive, acting, V2X(max_neighbours=0), seed=1, assumed=stated)
         wave = np.maximum(np.arange(len(seen.t)) / len(seen.t) - 0.5, 0.0)[:, None, None] * 10.0
-        log = replace(seen, gnss=seen.gnss + lasts * wave, notes=(f"odometry: {MEASURED}",))
+        log = replace(seen, gnss=seen.gnss + lasts * wave, notes=(f"odometry: {NOTHING_SIMULATED}",))
         fitted = NoiseModel.fitted(log, drive)
         assert fitted.name == name
         assert ("fitted to a part" in "".join(fitted.notes)) == (name == "nominal")

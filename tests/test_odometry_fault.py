@@ -14,7 +14,7 @@ from coopoc.arrays import Floats
 from coopoc.kernels.odometry_fault import MAX_Q, NOISIER, PACES, UNKNOWN
 from coopoc.methods.odometry_fault import with_odometry
 from coopoc.world.body_frames import turned
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 
 S2, EGOS, STEPS, BEGINS = co.Sensors.paper_scenario2(), [3, 8], 600, 200
 FAULTS: dict[str, Callable[[Floats], Floats]] = {
@@ -91,7 +91,7 @@ def test_odometry_that_errs_a_little_costs_no_more_than_in_the_kalman_filter(fau
     seen = observe(fleet, sensors, V2X(beside, radius=100.0), runs=4)
     gnss = np.where(np.arange(900)[:, None, None] % (2 if ships else 1), np.nan, seen.gnss)
     relative = np.where([True, False, False], seen.relative, np.nan)
-    log = replace(seen, gnss=gnss, velocity=seen.velocity + wrong, relative=relative, notes=(MEASURED,))
+    log = replace(seen, gnss=gnss, velocity=seen.velocity + wrong, relative=relative, notes=(NOTHING_SIMULATED,))
     mine, kalman = (
         np.sqrt(np.nanmean(np.square(m(log, (0, 1)).x - fleet.position)[..., :2].sum(axis=-1), axis=(0, 1)))
         for m in (CooperativeFilter(), Kalman())

@@ -53,7 +53,7 @@ def rows(table: Table | None) -> list[tuple[object, ...]]:
 
 
 def at(**where: object) -> dict[str, object]:
-    return {"max_neighbours": 2, **study.FREE, "method": "joint", "noise_model": "nominal", **where}
+    return {"max_neighbours": 2, **study.IDEAL_CHANNEL, "method": "joint", "noise_model": "nominal", **where}
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_channels_keep_their_order(results):
 def test_best_within_a_budget_never_gets_worse_with_it(results):
     texts = study.STUDY.answers(results)
     errors = [float(text.split()[-2]) for text in texts.values()]
-    assert len(errors) == len(study.LIMITS)
+    assert len(errors) == len(study.BYTE_LIMITS)
     assert (np.diff(errors) <= 0).all()
     assert "K =" not in texts["0 B/s"]
 

@@ -109,7 +109,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path,
     results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town})
     value = {
         name: [
-            numbers.rms(results, {**study.LASTING[f"{name}, K = {k}"], "method": "cooperative-filter"}) or np.nan
+            numbers.rms(results, {**study.LASTING_CASES[f"{name}, K = {k}"], "method": "cooperative-filter"}) or np.nan
             for k in (0, 6)
         ]
         for name in ("white", "own", "common")

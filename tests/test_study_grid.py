@@ -101,6 +101,8 @@ def test_assignments():
     with refused("gives a twice"):
         assignments(["a=1", "a=2"])
     assert parse("flag", "yes", False) is True
+    with refused("runs = True: must be a whole number"):
+        parse("runs", True, 30)
     assert [parse("x", text, None) for text in ("none", "3", "0.5", "word")] == [None, 3, 0.5, "word"]
 
 

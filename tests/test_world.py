@@ -35,7 +35,7 @@ S2 = Sensors.paper_scenario2()
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"t": [0.0, 0.1, 0.1]}, "dt"),
+        ({"t": [0.0, 0.1, 0.1]}, "t[2]"),
         ({"t": [0.0, 0.1, 0.3]}, "t"),
         ({"ids": ("a", "a")}, "ids"),
         ({"position": np.zeros((3, 1, 3))}, "position"),

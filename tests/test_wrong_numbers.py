@@ -185,16 +185,16 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances():
         z, moved = gnss[0, t, 0], drive.velocity[0, t, 0]
         peer.predict(u=moved, Q=np.diag(process[t]))
         gap, variance = z - peer.x, np.diag(peer.P)
-        q = float((gap**2 / (variance + r + gate.SLIP)).sum())
+        q = float((gap**2 / (variance + r + gate.SLIP_M2)).sum())
         gain = float((variance / (variance + r)).mean())
         since = 0.0 if q > gate.FIX_GATE else since + gain
         if copy is not None:
             x, p = copy[0] + 0.1 * moved, copy[1] + process[t]
             copy, vague = (x, p), p.sum() >= ((x - peer.x) ** 2).sum()
-            other = float(((z - x) ** 2 / (p + r + gate.SLIP)).sum())
+            other = float(((z - x) ** 2 / (p + r + gate.SLIP_M2)).sum())
             more = min(q, gate.HARD_REJECT_FACTOR * gate.FIX_GATE) - other
             evidence = max(evidence + more, 0.0) if other <= gate.FIX_GATE else 0.0
-            if evidence > gate.EVIDENCE * gate.HARD_REJECT_FACTOR * gate.FIX_GATE and not vague:
+            if evidence > gate.FIXES_TO_RETURN * gate.HARD_REJECT_FACTOR * gate.FIX_GATE and not vague:
                 peer.x, peer.P, copy, q, hits = x, np.diag(p), None, other, 0.0
                 returns.append(t)
             elif q <= gate.FIX_GATE and vague and since > gate.AWAY:

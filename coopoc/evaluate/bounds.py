@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 
 from ..arrays import Bools, Floats, Ints, checked, instance, refuse
 from ..errors import InputError
+from ..kernels.poses.odometry import UNKNOWN_HEADING_RAD2
 from ..kernels.stars.messages import FORGOTTEN
 from ..workers import one_thread, progress_bar
 from ..world.body_frames import body_motion, midway, true_heading, turned
@@ -21,10 +22,6 @@ from ..world.recording import Recording, Vehicles
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
 from ..world.v2x import V2X
-
-UNKNOWN_HEADING = 3.0 / np.pi**2
-"""1/rad^2 of a heading of which nothing is known: uniform over a turn."""
-
 
 NO_ERROR = 1e-18
 """m^2, variance of an error of the fixes that there is not."""
@@ -292,7 +289,7 @@ def pose_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints
     acting = (sensors.speed_scale_std, sensors.yaw_rate_bias_std, sensors.heading_bias_std * sensors.compass)
     lasting = [kind for kind, std in enumerate(acting) if std > 0]
     own, d = _own(sensors, lasting), 4 + len(lasting)
-    prior = np.concatenate([[0, 0, 0, UNKNOWN_HEADING], 1.0 / np.square([acting[kind] for kind in lasting])])
+    prior = np.concatenate([[0, 0, 0, 1.0 / UNKNOWN_HEADING_RAD2], 1.0 / np.square([acting[kind] for kind in lasting])])
     motion, process = _motion(fleet, sensors, lasting)
     stages = list[Stage]()
     for now, previous, edges in steps_of(fleet, links, members):

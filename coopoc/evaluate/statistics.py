@@ -6,11 +6,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats, checked
+from ..arrays import AnyArray, Floats, checked, refuse
 from ..errors import InputError
 
 RESAMPLES = 2000
 """Of the bootstrap."""
+WORSE_RATIO = 1.1
+"""Ratio of mean errors from which the first is called worse."""
 _CHUNK = 4_000_000
 
 
@@ -125,6 +127,5 @@ def _checked(name: str, values: AnyArray) -> Floats:
     array: Floats = np.atleast_2d(checked(name, values).T)
     if array.ndim != 2 or array.size == 0:
         raise InputError(name, array.T.shape, "must have shape (R, E) or (R,)", "Runs first, then egos.")
-    if not np.isfinite(array).all():
-        raise InputError(name, "not finite", "must be finite", "Leave out failed cells before you average.")
+    refuse(name, array.T, ~np.isfinite(array.T), "must be finite", "Leave out failed cells before you average.")
     return array

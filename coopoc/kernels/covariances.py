@@ -15,7 +15,7 @@ from .stars.messages import BLOCK, block_at, vector_at
 
 MAX_CORRELATION2 = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
-TOGETHER, DOUBT = 5, 36.0
+JUDGED_IN_A_ROW, DOUBT = 5, 36.0
 """Numbers in a row that are judged together: they contradict the track where all are beyond FIX_GATE, those of
 neighbours beyond HARD_REJECT_FACTOR times it; and the squared normalised mean of such a row, of three degrees of
 freedom, that chance does not reach."""
@@ -62,7 +62,8 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
 
 @compiled
 def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Floats, every: int, marks: Ints) -> Floats:
-    """Mark where TOGETHER fixes, one after the other, contradict estimates; the worst square of each vehicle (R, E).
+    """Mark where JUDGED_IN_A_ROW successive fixes contradict estimates. Returns the largest squared normalised
+    difference of each vehicle (R, E).
 
     Args:
         gnss: (R, T, N, 3) m, NaN for no fix.
@@ -90,17 +91,17 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
                     white, lasts = fix[now, columns[k], 0, c], fix[now, columns[k], 1, c]
                     r[c], p[c], q = (
                         r[c] + gap,
-                        p[c] + own + white / TOGETHER + lasts,
+                        p[c] + own + white / JUDGED_IN_A_ROW + lasts,
                         q + gap * gap / (white + lasts + own),
                     )
-                count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / TOGETHER
-                if count < TOGETHER:
+                count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / JUDGED_IN_A_ROW
+                if count < JUDGED_IN_A_ROW:
                     continue
                 for c in range(3):
-                    square += r[c] * r[c] / (TOGETHER * p[c])
+                    square += r[c] * r[c] / (JUDGED_IN_A_ROW * p[c])
                     r[c] = p[c] = 0.0
                 worst[run, k] = max(worst[run, k], mean, square)
-                kind = int(far < TOGETHER)
+                kind = int(far < JUDGED_IN_A_ROW)
                 if kind == 0 or (len(cov) > 0 and max(mean, square) > DOUBT):
                     for i in range(first, min(t, steps)):
                         marks[kind, k, i] = 1
@@ -120,7 +121,7 @@ def mark_odometers(
     dt: float,
     marks: Ints,
 ) -> None:
-    """Mark where the way between the means of TOGETHER fixes and of the next ones is not the odometer's.
+    """Mark where the way between the means of JUDGED_IN_A_ROW fixes and of the next ones is not the odometer's.
 
     Args:
         gnss: as of `mark_estimates`; columns, fix, every, marks: too.
@@ -144,9 +145,11 @@ def mark_odometers(
                     continue
                 first, count, after, steps = t if count == 0 else first, count + 1, t + every, t - begin
                 for c in range(3):
-                    now[0, c] += (gnss[run, t, columns[k], c] - moved[c]) / TOGETHER
-                    now[1, c] += (fix[t, columns[k], 0, c] / TOGETHER + fix[t, columns[k], 1, c]) / TOGETHER
-                if count < TOGETHER:
+                    now[0, c] += (gnss[run, t, columns[k], c] - moved[c]) / JUDGED_IN_A_ROW
+                    now[1, c] += (
+                        fix[t, columns[k], 0, c] / JUDGED_IN_A_ROW + fix[t, columns[k], 1, c]
+                    ) / JUDGED_IN_A_ROW
+                if count < JUDGED_IN_A_ROW:
                     continue
                 walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
                 for c in range(3):
@@ -171,7 +174,7 @@ def mark_neighbours(
     every: int,
     marks: Ints,
 ) -> None:
-    """Mark where TOGETHER messages or relative measurements of a neighbour are all far from estimates.
+    """Mark where JUDGED_IN_A_ROW messages or relative measurements of a neighbour are all far from estimates.
 
     Args:
         gnss: (R, T, N, 3) m.
@@ -205,10 +208,10 @@ def mark_neighbours(
             counts[j, 0], counts[j, 1] = t + every, counts[j, 1] + 1
             counts[j, 3] += message > HARD_REJECT_FACTOR * FIX_GATE
             counts[j, 4] += q > HARD_REJECT_FACTOR * FIX_GATE
-            if counts[j, 1] == TOGETHER:
+            if counts[j, 1] == JUDGED_IN_A_ROW:
                 for kind in range(2):
                     for k in range(
-                        counts[j, 2], min(t + every, len(cov[run])) if counts[j, 3 + kind] == TOGETHER else 0
+                        counts[j, 2], min(t + every, len(cov[run])) if counts[j, 3 + kind] == JUDGED_IN_A_ROW else 0
                     ):
                         marks[kind, j, k] = 1
                     counts[j, 3 + kind] = 0

@@ -44,16 +44,16 @@ one."""
 INITIAL_LOCKOUT = 4.8
 """That sum at the start of a pose or of a relative vector: a wrong heading or a wrong first measurement may have placed
 it, so the next ones that contradict it are believed. Of a position it is 0, since fixes err together."""
-SLIP = 0.25
+SLIP_M2 = 0.25
 """m^2, variance on each axis that slipping wheels, or a speed that was measured too low, may add to an error: a smaller
 innovation is no sign of a wrong fix, however precise fixes are."""
 AWAY = 0.5
 """Sum of the gains of accepted fixes from which they, and not the remembered position, have placed the filter: that
 position is then forgotten if it is less far away than it is uncertain."""
-EVIDENCE = 2.0
+FIXES_TO_RETURN = 2.0
 """Rejected fixes that it takes to go back: least excess of the filter's squared normalised innovations, each at most
 that of a fix that is just rejected, over those of the remembered position."""
-NOTHING = 1e30
+NOT_REMEMBERED_M2 = 1e30
 """m^2, variance of a position that is not remembered."""
 FORGET, KEEP, BEGIN, BACK, ANEW = -1.0, 0.0, 1.0, 2.0, 3.0
 """What `remember` returns, and that a start is left."""
@@ -61,7 +61,7 @@ CONFIRMED = 5.0
 """Fixes that agree with a start, itself included, from which the start counts as right."""
 MOST = HARD_REJECT_FACTOR * FIX_GATE
 """Squared normalised distance of two fixes, up to which they agree."""
-UNSEEN = 1e15
+NO_FIX_M2 = 1e15
 """m^2, variance of no fix."""
 Vector = tuple[float, ...]
 
@@ -95,7 +95,7 @@ def remember(
         gate: of a fix.
         gain: that the fix would have had.
         apart: m^2, squared distance of the two positions.
-        spread: m^2, trace of the covariance of the one that is remembered, NOTHING at least if none is.
+        spread: m^2, trace of the covariance of the one that is remembered, NOT_REMEMBERED_M2 at least if none is.
         evidence: for it.
         since: sum of the gains of fixes since the last beyond the gate.
     """
@@ -103,9 +103,9 @@ def remember(
     since = choose(q - gate, none, since + gain)
     evidence = choose(other - gate, none, max(evidence + choose(q - most, most + none, q) - other, none))
     vague = spread - apart
-    back = choose(vague, KEEP + none, choose(evidence - EVIDENCE * most, BACK + none, KEEP + none))
+    back = choose(vague, KEEP + none, choose(evidence - FIXES_TO_RETURN * most, BACK + none, KEEP + none))
     what = choose(vague, choose(since - AWAY, FORGET + none, back), back)
-    begin = choose(q - gate, spread - 0.5 * NOTHING, none)
+    begin = choose(q - gate, spread - 0.5 * NOT_REMEMBERED_M2, none)
     evidence = choose(begin, none, evidence)
     return choose(begin, BEGIN + none, choose(q - gate, back, what)), evidence, since
 
@@ -120,13 +120,13 @@ def vote(votes: Vector, moved: Vector, process: Vector, fix: Vector, variance: V
         moved: m, by odometry.
         process: m^2, variance of that.
         fix: m, NaN for none.
-        variance: m^2, UNSEEN at least for none.
+        variance: m^2, NO_FIX_M2 at least for none.
     """
     at, apart, ours, theirs = add(votes[:3], moved), votes[3:6], votes[7], votes[8]
     spread = votes[6] + (process[0] + process[1] + process[2]) / 3.0
     o, gap = 0.0 * spread, subtract(fix, at)
     q, other = apart_by(gap, variance, spread), apart_by(subtract(gap, apart), variance, spread)
-    seen = choose(UNSEEN - variance[0], o + 1.0, o)
+    seen = choose(NO_FIX_M2 - variance[0], o + 1.0, o)
     agrees, far = choose(MOST - q, seen, o), choose(q - MOST, seen, o)
     begins = choose(0.5 - ours, agrees + far, o)
     new = choose(other - MOST, far, o)
@@ -143,7 +143,7 @@ def vote(votes: Vector, moved: Vector, process: Vector, fix: Vector, variance: V
 def apart_by(gap: Vector, variance: Vector, spread: float) -> float:
     """Squared normalised distance of two fixes, one of them moved."""
     a, b, c = gap
-    s = spread + SLIP
+    s = spread + SLIP_M2
     return a * a / (2.0 * variance[0] + s) + b * b / (2.0 * variance[1] + s) + c * c / (2.0 * variance[2] + s)
 
 
@@ -157,7 +157,7 @@ def gain_of(cov: Vector, variance: Vector) -> float:
 @inside
 def distance(innovation: Vector, cov: Vector) -> Lanes:
     """Squared normalised innovation of a position."""
-    return inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation))
+    return inner_product(innovation, apply(inverse(add_diagonal(cov, (SLIP_M2, SLIP_M2, SLIP_M2))), innovation))
 
 
 @inside

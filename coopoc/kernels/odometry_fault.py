@@ -38,7 +38,7 @@ PACES = ((0.001, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 0.2, 0.5, 5.0, 2.0))
 """Of the random walks of b: the density of its acceleration m^2/s^3; the evidence that its filter loses where it begins
 anew; and the least error of an odometry that fails, as a share of the way, in m for each second, and in standard
 deviations of a fix, and for how many s it lasts."""
-TOGETHER = 0.4
+AVERAGED_FIXES_S = 0.4
 """s, interval whose fixes are averaged into one."""
 RESTART_Q, MAX_Q = 14.0, 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
@@ -51,7 +51,7 @@ WANDERS = 2.0
 NOISIER, UNKNOWN = 0.1, 4.0
 """Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
 for at first, and that of odometry all the time."""
-SPEED_MEMORY, LIKELY_KEPT = 10.0, 0.9
+SPEED_MEMORY_S, LIKELY_KEPT = 10.0, 0.9
 """s, for which a speed is remembered; share of LIKELY that is left at the next fix."""
 
 
@@ -136,7 +136,7 @@ def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     state[GAPS + 1] += north
     state[TIMES] += state[SINCE]
     state[COUNT] += 1.0
-    if state[SINCE] < TOGETHER - 0.5 * dt:
+    if state[SINCE] < AVERAGED_FIXES_S - 0.5 * dt:
         return 0.0
     failed = state[FAILS] > 0.0
     gather_evidence(state, r / state[COUNT], dt)
@@ -159,7 +159,7 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     speed2, true2 = east**2 + north**2, (east + state[ERROR]) ** 2 + (north + state[ERROR + 1]) ** 2
     state[FASTEST] = max(state[FASTEST], speed2)
     speed2 = max(speed2, true2) if state[FAILS] > 0.0 else speed2
-    state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / SPEED_MEMORY, 0.0), speed2)
+    state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / SPEED_MEMORY_S, 0.0), speed2)
     q = state[BASE] + interval**2 * max(state[RATIO] * speed2, state[FLOOR] ** 2)
     q *= UNKNOWN * time / interval
     p, pb, bb = state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2]

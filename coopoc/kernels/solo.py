@@ -15,12 +15,12 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, inside, part
 from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import ANEW, BACK, BEGIN, CONFIRMED, KEEP, NOTHING, SLIP, count, inflation, remember, vote
+from .gate import ANEW, BACK, BEGIN, CONFIRMED, KEEP, NOT_REMEMBERED_M2, SLIP_M2, count, inflation, remember, vote
 from .motion import MotionNoise
 
 AxisState: TypeAlias = tuple[float, ...]
 START, APART, VOTES = 7, 8, 9
-STATE: AxisState = (0.0, 0.0, 0.0, 0.0, NOTHING, 0.0, 0.0, 0.0, 0.0, 0.0, CONFIRMED, 0.0)
+STATE: AxisState = (0.0, 0.0, 0.0, 0.0, NOT_REMEMBERED_M2, 0.0, 0.0, 0.0, 0.0, 0.0, CONFIRMED, 0.0)
 """At a position that is known; its length is the count that `load` takes."""
 Vector: TypeAlias = tuple[float, float, float]
 Gated: TypeAlias = tuple[float, float, float, float, float]
@@ -61,7 +61,7 @@ class SoloMeasurements(NamedTuple):
 @inside
 def start_state(x: float, variance: float, votes: float) -> AxisState:
     """State at a position."""
-    return x, variance, 0.0, 0.0, NOTHING, 0.0, 0.0, x, 0.0, 0.0, votes, 0.0
+    return x, variance, 0.0, 0.0, NOT_REMEMBERED_M2, 0.0, 0.0, x, 0.0, 0.0, votes, 0.0
 
 
 @inside
@@ -91,15 +91,15 @@ def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, noise:
     for c in range(3):
         innovation = fix[c] - states[c, 0] - moved[c]
         if not math.isnan(innovation):
-            q += innovation * innovation / (states[c, 1] + process[c] + noise[c] + SLIP)
-    if q <= gate and hits == 0.0 and states[0, 4] >= NOTHING:
+            q += innovation * innovation / (states[c, 1] + process[c] + noise[c] + SLIP_M2)
+    if q <= gate and hits == 0.0 and states[0, 4] >= NOT_REMEMBERED_M2:
         return 1.0, 0.0, KEEP, 0.0, 0.0
     for c in range(3):
         gap, p = states[c, 3] - states[c, 0], states[c, 4] + process[c]
         apart, spread = apart + gap * gap, spread + p
         if not math.isnan(fix[c]):
             innovation = fix[c] - states[c, 3] - moved[c]
-            other += innovation * innovation / (p + noise[c] + SLIP)
+            other += innovation * innovation / (p + noise[c] + SLIP_M2)
             p = states[c, 1] + process[c]
             gain += p / (3.0 * (p + noise[c]))
     what, evidence, since = remember(q, other, gate, gain, apart, spread, states[0, 5], states[0, 6])
@@ -123,7 +123,7 @@ def step(state: AxisState, moved: float, process: float, fix: float, noise: floa
     elif what != KEEP:
         if what == BACK:
             x, p = before, spread
-        spread = NOTHING
+        spread = NOT_REMEMBERED_M2
     if not (math.isnan(fix) or math.isinf(f)):
         k = p / (p + f * noise)
         x, p = x + k * (fix - x), (1.0 - k) * (1.0 - k) * p + k * k * f * noise

@@ -23,7 +23,7 @@ from .noise_model import NoiseModel, resolve
 from .odometry_fault import with_odometry
 from .track import Checked, Track
 
-FOUND = {
+FOUND_UNITS = {
     "heading error": "rad",
     "scale error": "",
     "compass error": "rad",
@@ -32,7 +32,7 @@ FOUND = {
     "slips": "of the steps",
     "alone": "of the steps, as what is measured of its neighbours contradicts its fixes",
 }
-LEVELS = ("range", "azimuth", "inclination", "fix", "message", "motion")
+LEVEL_NAMES = ("range", "azimuth", "inclination", "fix", "message", "motion")
 NOTED_ERRORS = (0.01, 0.01, 0.01, 0.1, 0.01, 0.01, 0.0)
 """Least of what is found that is worth a note."""
 NOTED_LEVEL = 1.5
@@ -229,7 +229,7 @@ class CooperativeFilter(Checked):
             fixes, deviations, x, cov = np.split(of_ego, [1, -12, -9], axis=-1)
             neighbours, weights = by_link[..., :3], by_link[..., 3:]
             extras = {"fix": fixes} | {kind: weights[..., k] for k, kind in enumerate((*WEIGHED, "clock"))}
-            names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
+            names = (*(name.replace(" ", "_") for name in FOUND_UNITS), *(f"{kind}_level" for kind in LEVEL_NAMES))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
             if priors.fix_gate and np.isfinite(x).any():
@@ -275,15 +275,15 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
     usual[5:7] = np.nanmean(found[..., 5:7], axis=(0, 1))
-    usual[len(FOUND) :][(late[..., len(FOUND) :] == 1.0).all(axis=(0, 1))] = np.nan
+    usual[len(FOUND_UNITS) :][(late[..., len(FOUND_UNITS) :] == 1.0).all(axis=(0, 1))] = np.nan
     usual[10:12] *= fix
     least = np.maximum(NOTED_ERRORS, (0.0, 0.0, *stated, 0.0, 0.0, 0.0))
     notes = [
         f"{name}, {ego}: {value:.2g} {unit}".rstrip()
-        for (name, unit), value, most in zip(FOUND.items(), usual, least, strict=False)
+        for (name, unit), value, most in zip(FOUND_UNITS.items(), usual, least, strict=False)
         if value > most
     ]
-    levels = zip(LEVELS, usual[len(FOUND) :], strict=True)
+    levels = zip(LEVEL_NAMES, usual[len(FOUND_UNITS) :], strict=True)
     return notes + [
         f"{kind} level, {ego}: {value:.2g} times the stated deviation"
         for kind, value in levels

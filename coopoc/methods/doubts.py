@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..kernels.covariances import DOUBT, TOGETHER, mark_estimates, mark_neighbours, mark_odometers
+from ..kernels.covariances import DOUBT, JUDGED_IN_A_ROW, mark_estimates, mark_neighbours, mark_odometers
 from ..world.links import stretches
 from ..world.recording import Recording
 from .noise_model import NoiseModel
@@ -17,7 +17,7 @@ DOUBTS = (
     "covariances, {}: contradicted by fixes",
     "odometer, {}: contradicted by fixes; it slips, or they jump",
 )
-NEIGHBOURS = "messages, {} and {}: far from estimates", "relative measurements, {} and {}: far from estimates"
+NEIGHBOUR_DOUBTS = "messages, {} and {}: far from estimates", "relative measurements, {} and {}: far from estimates"
 
 
 def when(t: Floats, marked: Bools) -> str:
@@ -39,7 +39,7 @@ def doubts(
     noise_model: NoiseModel | str = "nominal",
     neighbours: Floats | None = None,
 ) -> tuple[str, ...]:
-    """Notes of what contradicts the estimates of some vehicles in any run, and when: TOGETHER numbers in a row.
+    """Notes of what contradicts the estimates of some vehicles in any run, and when: JUDGED_IN_A_ROW numbers in a row.
 
     Receivers that are rejected or filters that are lost: all fixes are beyond their gate. Covariances: the fixes' mean,
     or their mean square, is farther off than chance allows. Odometers: the fixes move otherwise, again beyond chance.
@@ -63,7 +63,7 @@ def doubts(
     egos, claimed = np.asarray(columns, dtype=np.int64), cov if cov is not None and stated else np.zeros((0,) * 5)
     fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
     fix[1] = fix[1].sum()
-    every = max(min(round(JUDGED_SECONDS / recording.dt), steps // TOGETHER), 1)
+    every = max(min(round(JUDGED_SECONDS / recording.dt), steps // JUDGED_IN_A_ROW), 1)
     marks = np.zeros((3, len(egos), steps), int)
     turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
     motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
@@ -91,5 +91,5 @@ def doubts(
             star = recording.gnss, recording.relative, x[:, :, k], claimed[:, :, k], theirs, rows
             mark_neighbours(*star, fixes, std, 2 * every, far)
             for kind, j in np.argwhere(far.any(axis=2)).tolist():
-                add(NEIGHBOURS[kind], far[kind, j], ego, j)
+                add(NEIGHBOUR_DOUBTS[kind], far[kind, j], ego, j)
     return tuple(notes)

@@ -39,8 +39,7 @@ class GNSS(Alone):
         newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)
         x, missing = np.take_along_axis(fixes, newest, axis=1), 100 * (1 - there.mean())
         notes = (f"holds the last fix where there is none: {missing:.0f} % of the steps",) if missing else ()
-        variance = np.square(recording.sensors.gnss_std * recording.fix_scale[:, columns])
-        variance = np.broadcast_to(variance, x.shape)
+        variance = np.broadcast_to(np.square(recording.sensors.gnss_std * recording.fix_scale[:, columns]), x.shape)
         return solo_track(recording, columns, x, variance, began, notes)
 
 
@@ -124,6 +123,14 @@ def solo_track(
     return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
 
+def known_start(x0: Floats, shape: tuple[int, ...]) -> Floats:
+    """A known start x0 (R, E, 3) or (E, 3) m in the shape (R, E, 3); InputError for another one."""
+    if np.shape(x0) not in (shape, shape[1:]):
+        allowed = f"must be (R, E, 3) = {shape} or (E, 3)"
+        raise InputError("x0", f"shape {np.shape(x0)}", allowed, "Give one position per ego.")
+    return np.broadcast_to(x0, shape)
+
+
 def solo_filter(
     recording: Recording,
     columns: npt.ArrayLike,
@@ -161,10 +168,8 @@ def solo_filter(
         process, scale = noise.process_variance(recording, columns, first=first), noise.fix_scale(recording)
     variance = np.broadcast_to(scale**2 * fixes.variance, gnss.shape[1:])[:, columns]
     inputs = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), variance, columns, recording.dt)
-    if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
-        raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
     x, p = np.empty(size), np.empty(size)
     if x0 is not None:
-        x[:, 0] = x0
+        x[:, 0] = known_start(x0, (len(gnss), *shape[2:]))
     return x, p, run_filter(inputs, fixes.gate, x0 is not None, index, x, p)

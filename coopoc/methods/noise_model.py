@@ -65,8 +65,8 @@ class NoiseModel:
         for field in ("process_std", "gnss_std"):
             if field == "gnss_std" or self.process_std is not None:
                 value = checked(field, getattr(self, field), "(3,)", (3,))
-                if not (np.isfinite(value) & (value > 0)).all():
-                    raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
+                wrong = ~(np.isfinite(value) & (value > 0))
+                refuse(field, value, wrong, "must be positive and finite", "Assumed noise may not be zero.")
                 self.__dict__[field] = tuple(value.tolist())
 
     @classmethod

@@ -101,7 +101,7 @@ def parse(name: str, value: Any, default: Any) -> Any:
     try:
         if kind is bool:
             return _BOOLS[str(value).lower()]
-        if kind is int and isinstance(value, float) and value % 1:
+        if isinstance(value, bool) or (kind is int and isinstance(value, float) and value % 1):
             raise ValueError
         return kind(value)
     except (ValueError, KeyError, TypeError, OverflowError):

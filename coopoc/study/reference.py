@@ -50,7 +50,7 @@ NUMBER_READERS: Mapping[str, Any] = {
     "better": lambda better: better if better in ("lower", "higher") else _finite(better),
 }
 """Field of a number -> how it is read."""
-FREE = ("runs", "weights", "backend", "metric")
+FREE_SETTINGS = ("runs", "weights", "backend", "metric")
 """Settings that may differ from those of the reference."""
 
 
@@ -171,9 +171,9 @@ def check(results: Results, reference: Reference) -> list[Change]:
     """
     measured = measure(results, {number.metric: number.better for number in reference.numbers})
     a, b = reference.settings, measured.settings
-    if others := sorted(name for name in {*a, *b} - {*FREE} if a.get(name) != b.get(name)):
+    if others := sorted(name for name in {*a, *b} - {*FREE_SETTINGS} if a.get(name) != b.get(name)):
         differs = f"is not the reference's in {', '.join(others)}"
-        hint = f"Run it with its own settings; {', '.join(FREE)} may differ."
+        hint = f"Run it with its own settings; {', '.join(FREE_SETTINGS)} may differ."
         raise InputError("settings", results.study, differs, hint)
     before, changes = {number.key: number for number in reference.numbers}, []
     for now in measured.numbers:

@@ -18,7 +18,7 @@ from .results import Results
 from .style import look, title, words
 from .tables import Table
 
-OWN = Path(__file__).parent
+TEMPLATES = Path(__file__).parent
 LARGEST_DRAWING = 1_000_000
 """Bytes of an SVG beyond which the page shows the PNG."""
 
@@ -66,8 +66,8 @@ def report(
         sections=sections,
         cards=cards or {},
         environment=environments([section["environment"] for section in sections]),
-        css=Markup((OWN / "report.css").read_text("utf-8")),
-        script=Markup((OWN / "report.js").read_text("utf-8")),
+        css=Markup((TEMPLATES / "report.css").read_text("utf-8")),
+        script=Markup((TEMPLATES / "report.js").read_text("utf-8")),
     )
     write(out, page)
     return out
@@ -108,7 +108,7 @@ def _figure(folder: Path, view: Mapping[str, Any]) -> dict[str, Any]:
 
 def _template() -> jinja2.Template:
     jinja = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(OWN),
+        loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -17,11 +17,11 @@ from ..text import short_repr
 from . import store
 from .cell import Params
 from .manifest import read
-from .style import METHODS, OWN
+from .style import METHODS, OWN_NAMES
 
 SEED = "train_seed"
 """Column of the training seed: means are taken over it, and intervals are not."""
-NOTHING = Interval(float("nan"), float("nan"), float("nan"), 0)
+NO_VALUES = Interval(float("nan"), float("nan"), float("nan"), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Results:
         if "label" in self.frame:
             own = self.frame.dropna(subset=["label"]).groupby("method")["label"].first().astype(str)
             taken = own.duplicated(keep=False) | own.isin([look.label for look in METHODS.values()])
-            OWN.update(own.mask(taken, own + " (" + own.index + ")"))
+            OWN_NAMES.update(own.mask(taken, own + " (" + own.index + ")"))
 
     @classmethod
     def load(cls, folder: str | Path) -> "Results":
@@ -140,7 +140,7 @@ class Results:
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
             grid, missing = ego_by_run(frame, value)
-            each = mean_interval(grid.T) if grid.size else NOTHING
+            each = mean_interval(grid.T) if grid.size else NO_VALUES
             rows.append([*names, each.mean, each.low, each.high, each.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 

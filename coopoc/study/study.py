@@ -152,7 +152,7 @@ class Study:
                 raise unknown("setting", name, [*settings, *axes])
         changed = replace(self, settings=settings, grid=grid)
         for name in changes.keys() - settings.keys():
-            _check_used(changed, name)
+            _check_used(changed, name, axes[name])
         return changed
 
 
@@ -222,15 +222,20 @@ def points(study: Study) -> list[Mapping[str, Scalar]]:
     return [p for p in grid if study.where({**study.settings, **p})]
 
 
-def _check_used(study: Study, name: str) -> None:
-    """InputError for a value on an axis that leads to no cell."""
+def _check_used(study: Study, name: str, usual: Sequence[Scalar]) -> None:
+    """InputError for a value on an axis that leads to no cell, where another or a usual one does."""
     if not isinstance(study.grid, Mapping):
         return
-    used = {p[name] for p in points(study)}
+    used = _used(study, name) or _used(replace(study, grid={**study.grid, name: usual}), name)
     for value in study.grid[name]:
         if used and value not in used:
-            rest = ",".join(map(str, dict.fromkeys(v for v in study.grid[name] if v in used)))
+            rest = ",".join(map(str, used))
             raise InputError(name, repr(value), "leads to no cell under these settings", f"Write {name}={rest}.")
+
+
+def _used(study: Study, name: str) -> list[Scalar]:
+    """Values of an axis that lead to cells."""
+    return list(dict.fromkeys(p[name] for p in points(study)))
 
 
 def _narrow(grid: Any, name: str, value: Any, values: Sequence[Scalar]) -> Any:

@@ -52,9 +52,9 @@ SUFFIXES = {"m": "m", "s": "s", "hz": "Hz", "deg": "°"}
 """End of a column's name -> unit."""
 
 
-NOT_CAUSAL = ", not causal"
+NOT_CAUSAL_SUFFIX = ", not causal"
 """In the label of a method whose estimates change with what is measured later."""
-OWN: dict[str, str] = {}
+OWN_NAMES: dict[str, str] = {}
 """Method that is none of ours -> the name that its class gives itself, as its rows have it."""
 
 
@@ -75,7 +75,7 @@ def look(method: str) -> Look:
         return Look(f"{shown.label} {number}", color, shown.marker)
     full_name, method = method, method.rpartition(".py:")[2]  # of a file: its name there
     row, column = divmod(zlib.crc32(method.encode()) % 25, 5)
-    return Look(OWN.get(full_name, method.replace("_", " ")), COLORS[column], "<>d8H"[row])
+    return Look(OWN_NAMES.get(full_name, method.replace("_", " ")), COLORS[column], "<>d8H"[row])
 
 
 def line(noise_model: object) -> Any:

@@ -13,16 +13,16 @@ from tabulate import tabulate
 
 from ..arrays import one_of
 from ..errors import InputError
-from ..evaluate.statistics import Interval
+from ..evaluate.statistics import WORSE_RATIO, Interval
 from ..paths import write
 from ..text import markdown, spreadsheet, tex, visible
 from .numbers import Number, Results, Where, alike
-from .style import METHODS, NOT_CAUSAL, label, title, words
+from .style import METHODS, NOT_CAUSAL_SUFFIX, label, title, words
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
 REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
-_SMOOTHERS = METHODS["batch-smoother"].label, NOT_CAUSAL
+_SMOOTHERS = METHODS["batch-smoother"].label, NOT_CAUSAL_SUFFIX
 """Label of the method that uses later measurements, too: it is not compared with the others."""
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
@@ -288,8 +288,8 @@ def lost(results: Results, where: Where | None = None) -> list[str]:
     return [text.format(label("method", name), count) for name, count in runs.items() if count]
 
 
-EQUAL_ERRORS, WORSE_RATIO = 1e-3, 1.1
-"""m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
+EQUAL_ERRORS_M = 1e-3
+"""Difference of errors that is none."""
 
 
 def unused(results: Results, real: bool) -> list[str]:
@@ -307,10 +307,10 @@ def unused(results: Results, real: bool) -> list[str]:
         together, alone = (both[f"{value}_{side}"] for side in "xy")
         gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
         text = f"{label('method', method)}, K = {k}:"
-        if k and len(gap) == len(part) and gap.max() < EQUAL_ERRORS:
+        if k and len(gap) == len(part) and gap.max() < EQUAL_ERRORS_M:
             lacks = "what was measured lacks what it takes, such as an azimuth"
             why = lacks if part["bytes_per_second"].any() else "no message arrived"
-            text += f" equal to solo within {EQUAL_ERRORS:g} m: no neighbour's measurement was used, because {why}."
+            text += f" equal to solo within {EQUAL_ERRORS_M:g} m: no neighbour's measurement was used, because {why}."
         elif k and real and together.mean() > WORSE_RATIO * alone.mean():
             text += f" worse than alone, {together.mean():.3g} m for {alone.mean():.3g} m: what was measured of "
             text += "neighbours, or its stated noise, is wrong. coopoc data check says what looks so."

@@ -11,7 +11,7 @@ from .links import Links, wrap
 from .recording import Body, Recording, check_recording
 from .sensors import Sensors, stream
 
-MIN_COURSE_SPEED = 0.1
+STANDING_SPEED_M_S = 0.1
 """m/s, below which a vehicle keeps its heading: the course of one that stands is noise."""
 
 
@@ -27,7 +27,7 @@ def true_heading(fleet: Fleet) -> Floats:
     if fleet.heading is not None:
         return fleet.heading
     x, y = fleet.velocity[..., 0], fleet.velocity[..., 1]
-    course = np.where(np.hypot(x, y) >= MIN_COURSE_SPEED, np.arctan2(y, x), np.nan)
+    course = np.where(np.hypot(x, y) >= STANDING_SPEED_M_S, np.arctan2(y, x), np.nan)
     for column in course.T:
         finite = np.flatnonzero(np.isfinite(column))
         held = np.searchsorted(finite, np.arange(len(column)), side="right") - 1

@@ -7,10 +7,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import TINY, Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, remade, texts
+from ..arrays import TINY, Bools, Floats, Ints, checked, instance, listed, plain, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
-from .fleet import clock, columns, interval, names
+from .fleet import check_steps, clock, columns, interval, names
 from .links import Links, drop_steep_azimuths, stretches
 from .plausible import MAX_POSITION, MAX_SPEED, MAX_YAW_RATE, headings, plausible, radians
 from .sensors import Sensors
@@ -59,13 +59,13 @@ class Body:
 DEGREES_STD = 0.5
 """rad, of a standard deviation that is rather one in degrees."""
 UNLIKELY = "unlikely: "
-UNITS = "velocities are in m/s, headings and yaw rates in radians and anticlockwise, headings from east"
+UNITS_NOTE = "velocities are in m/s, headings and yaw rates in radians and anticlockwise, headings from east"
 """First word of a note on what a recording holds, and what may be wrong with odometry."""
 COMPARED_SECONDS, LONG_STDS, APART_SHARE, CONTRADICTING_SHARE = 10.0, 6.0, 0.4, 0.3
 """s between the fixes whose distance is compared with the odometry's; standard deviations of a fix, stated and as they
 scatter, that the longer of the two must have (the shorter one: one); share of both lengths by which they contradict
 each other; share of such pairs, of all."""
-MEASURED = "nothing is simulated"
+NOTHING_SIMULATED = "nothing is simulated"
 """Words in the notes of a recording that holds measurements as they were logged."""
 
 
@@ -167,7 +167,7 @@ class Recording:
     @property
     def measured(self) -> bool:
         """Whether the notes say that nothing is simulated."""
-        return any(MEASURED in note for note in self.notes)
+        return any(NOTHING_SIMULATED in note for note in self.notes)
 
     @property
     def unlikely(self) -> tuple[str, ...]:
@@ -204,8 +204,7 @@ class Recording:
         >>> len(observe(fleet, Sensors()).between(1, 3).t)
         2
         """
-        for name, step in (("start", start), ("stop", stop)):
-            number(name, step, 0, 2**62, kind=int, allowed="a step, >= 0", hint="Count steps from 0.")
+        check_steps(start, stop, 0)
         kept = np.flatnonzero((self.links.step >= start) & (self.links.step < stop))
         links, arrival, body = self.links, self.arrival[:, kept], self.body
         return replace(
@@ -394,7 +393,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
         if (std := getattr(sensors, name)) > DEGREES_STD
     ]
     if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
-        sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
+        sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS_NOTE}")
     return tuple(UNLIKELY + text for text in sentences)
 
 

@@ -35,8 +35,8 @@ ARRAYS = (
 )
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
-WORDS = "coopoc_recording"
-NAMES = (
+FORMAT_NAME = "coopoc_recording"
+FIELD_NAMES = (
     *ARRAYS,
     *BODY,
     *(f"links_{name}" for name in LINKS),
@@ -70,7 +70,7 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
         arrays |= {"truth_position": truth.position, "truth_velocity": truth.velocity}
         if truth.heading is not None:
             arrays["truth_heading"] = truth.heading
-    named = {WORDS: np.array(json.dumps(words)), **arrays}
+    named = {FORMAT_NAME: np.array(json.dumps(words)), **arrays}
     write(path, lambda file: np.savez_compressed(file, **named))
 
 
@@ -96,7 +96,11 @@ def _check_shapes(packed: zipfile.ZipFile) -> None:
             read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
             shape, _, dtype = read(file)
         name = part.filename.removesuffix(".npy")
-        if name in shapes or name not in (WORDS, *NAMES) or math.prod(shape) * dtype.itemsize > part.file_size:
+        if (
+            name in shapes
+            or name not in (FORMAT_NAME, *FIELD_NAMES)
+            or math.prod(shape) * dtype.itemsize > part.file_size
+        ):
             raise ValueError(f"an array {name[:60]} of shape {shape} and dtype {dtype}")
         shapes[name] = shape
     runs, steps, vehicles, _ = shapes["gnss"]
@@ -114,7 +118,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     path = given_path(path)
     try:
         arrays = unpacked(path)
-        return _recording(json.loads(str(arrays.pop(WORDS))), arrays)
+        return _recording(json.loads(str(arrays.pop(FORMAT_NAME))), arrays)
     except Exception as error:  # of zipfile, zlib and NumPy: a damaged file meets them all
         cause = said(error)
     raise InputError(path.name, cause, "must be a recording in .npz", "Write it again with save_recording.")

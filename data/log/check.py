@@ -69,7 +69,7 @@ PERHAPS = 2.0
 """Standard errors from which an error may be real, and is named as not known."""
 DIVERGED = 0.3
 """Scale error of odometry beyond which the filter that estimates it has diverged."""
-USED = "fixes", "relative measurements", "edges", "messages"
+USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of reasons that are no fault of the log."""
@@ -211,7 +211,7 @@ def _of_rows(c: Check) -> list[str]:
     """Measurements and columns that were left out."""
     summary, sentences = c.log.summary, []
     left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith(EXPECTED)}
-    used = [number for why, number in left.items() if any(word in why for word in USED)]
+    used = [number for why, number in left.items() if any(word in why for word in USED_COUNTS)]
     share = max(
         sum(used) / max(sum(used) + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or np.inf)
     )

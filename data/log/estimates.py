@@ -11,7 +11,7 @@ from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
 
 from .motion import COURSE, MOVING
-from .residuals import Check, filtered, plane, residual_of
+from .residuals import Check, distances, filtered, plane, residual_of
 
 SURE_ERRORS, SURE_CLOCK_ERRORS = 4.0, 5.0
 """Standard errors beyond which an estimate is significant, of many in a few logs; and one of clocks and ranges."""
@@ -283,7 +283,7 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     """
     links, size = c.world.links, len(c.world.ids)
     gap, _ = residual_of(c.world, c.x)
-    flat, far = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
+    flat, far = distances(gap)
     ends = np.eye(size)[links.neighbour] - np.eye(size)[links.observer]
 
     def made_by(velocity: Floats) -> Floats:

@@ -15,7 +15,7 @@ from .motion import COURSE, Member, Steps, stacked
 from .units import Rows, Summary, in_group, only, stated_std
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
-PAIR = ["step", "observer", "neighbour"]
+LINK_COLUMNS = ["step", "observer", "neighbour"]
 NEAR_MOTIONS, NEAR_STDS = 10.0, 4.0
 """Distances, over what the two move until the step, and over the standard deviation of a fix, below both of which a
 direction is not known well enough."""
@@ -44,8 +44,8 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     if mutual:
         stands = np.array([member.stands for member in members.values()])
         far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
-        aimed = measured.loc[measured["component"] == 1, PAIR]
-        reached = pd.MultiIndex.from_frame(far[PAIR]).isin(pd.MultiIndex.from_frame(aimed))
+        aimed = measured.loc[measured["component"] == 1, LINK_COLUMNS]
+        reached = pd.MultiIndex.from_frame(far[LINK_COLUMNS]).isin(pd.MultiIndex.from_frame(aimed))
         if reached.any():
             summary.assume(RADAR, str(int(reached.sum())))
         back = far[~reached]
@@ -53,12 +53,12 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
         own = measured["observer"] * len(members) + measured["neighbour"]
         summary.told = np.setdiff1d(heard, own).tolist()
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
-        both = both.drop_duplicates([*PAIR, "component"])
+        both = both.drop_duplicates([*LINK_COLUMNS, "component"])
         if len(both) > len(measured):
             summary.assume(TWO_WAY, str(len(both) - len(measured)))
         measured = both
     arrived, broadcasts = _messages(sent, tuple(members), there, steps)
-    table = measured.pivot(index=PAIR, columns="component", values="value").reindex(columns=[0, 1, 2])
+    table = measured.pivot(index=LINK_COLUMNS, columns="component", values="value").reindex(columns=[0, 1, 2])
     table = table.join(arrived, how="outer").reset_index()
     table = table.iloc[np.lexsort((table[0], table["observer"], table["step"]))]
     relative, arrival = table[[0, 1, 2]].to_numpy(dtype=float), table["arrival"].fillna(-1).to_numpy(dtype=np.int64)
@@ -67,7 +67,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
         relative = np.where(flat[:, None] & (np.arange(3) == 2), np.pi / 2, relative)
         if flat.any():
             summary.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")
-    links = Links(*table[PAIR].to_numpy(dtype=np.int64).T)
+    links = Links(*table[LINK_COLUMNS].to_numpy(dtype=np.int64).T)
     if not len(sent):
         arrival, broadcasts = links.step.copy(), there
         if len(links):
@@ -149,7 +149,7 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     numbers = {"step": step, "lag": lag, "observer": observer, "neighbour": neighbour, "value": value}
     table = rows.assign(**numbers, component=rows["kind"].map(COMPONENTS).astype(np.int64))[good]
     table = table.sort_values("lag", key=np.abs, kind="stable")
-    again = table.duplicated([*PAIR, "component"])
+    again = table.duplicated([*LINK_COLUMNS, "component"])
     reason = "relative measurements beside a nearer one of the same pair, kind and step"
     summary.refuse(reason, table[again].sort_index())
     table = table[~again]
@@ -158,7 +158,7 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     moved, vague, full = _to_step(table, members, steps, NEAR_STDS * (std if std > 0.0 else Sensors().gnss_std[0]))
     summary.refuse("relative measurements off the steps, of what is too near", table[vague])
     summary.refuse("relative measurements at the most that is measured, of what is further away", table[full])
-    kept: pd.DataFrame = table.assign(value=moved).loc[~vague & ~full, [*PAIR, "component", "value"]]
+    kept: pd.DataFrame = table.assign(value=moved).loc[~vague & ~full, [*LINK_COLUMNS, "component", "value"]]
     for word, number in zip(words, np.bincount(kept["component"], minlength=3).tolist(), strict=True):
         summary.count(word, number)
     return kept
@@ -180,10 +180,12 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     late = (rows["arrival"] - rows["t"]).to_numpy()
     arrival = step[k] + np.maximum(np.ceil((late[k] - 2e-6) / steps.dt), 0.0)
     table = pd.DataFrame({"step": step[k], "observer": j, "neighbour": sender[k], "arrival": arrival})
-    summary.refuse("messages beside another of the same pair and step", rows.iloc[k[table.duplicated(PAIR).to_numpy()]])
+    summary.refuse(
+        "messages beside another of the same pair and step", rows.iloc[k[table.duplicated(LINK_COLUMNS).to_numpy()]]
+    )
     summary.count("messages", int(sent.sum()))
     summary.count("messages that were lost", int(np.isinf(late[sent]).sum()))
-    return table.groupby(PAIR)[["arrival"]].min().replace(np.inf, -1), broadcasts
+    return table.groupby(LINK_COLUMNS)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
 def _to_step(
@@ -197,7 +199,7 @@ def _to_step(
     than `std`.
     """
     velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
-    step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
+    step, observer, neighbour, component = (table[name].to_numpy() for name in (*LINK_COLUMNS, "component"))
     value, lag = table["value"].to_numpy(), table["lag"].to_numpy()
     after = np.minimum(step + (lag > 0), len(velocity) - 1)
 

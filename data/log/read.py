@@ -17,7 +17,7 @@ from coopoc.paths import given_path
 from coopoc.text import short_repr
 from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
-from coopoc.world.recording import MEASURED
+from coopoc.world.recording import NOTHING_SIMULATED
 
 from ..assemble import (
     SAME_INSTANT,
@@ -35,7 +35,7 @@ from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
 from ..librsf import is_librsf, read_librsf
 from ..nclt import is_nclt, read_nclt
-from ..nmea import read_nmea
+from ..nmea import DAY_S, read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
@@ -45,11 +45,9 @@ from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
-DAY = 86400.0
-"""s."""
 LOST = 0.02
 """Largest share of the fixes that may fall on a step that already has one, and are lost."""
-SHORTEST_STEP, LONGEST_STEP, PAIR = 0.02, 1.0, ("vehicle", "partner")
+SHORTEST_STEP, LONGEST_STEP, PAIR_COLUMNS = 0.02, 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
 FREQUENT_SHARE = 0.1
 """Share of the measurements of the most frequent vehicle, or pair, from which one counts for the step."""
@@ -63,7 +61,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore, stamps, ...) -> its rows. A new format is one more
 entry."""
-TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
+TRUTH_NAME = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 """Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
 SPARSE_SECONDS = 0.5
 """s between samples of a truth from which straight lines between them are not the path; within so many s of a sample
@@ -276,7 +274,7 @@ def _recording(
         sensors=sensors,
         v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
-        notes=(f"measurements of {summary.name}, {MEASURED}", *summary.sentences),
+        notes=(f"measurements of {summary.name}, {NOTHING_SIMULATED}", *summary.sentences),
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
         fix_factor=factor,
@@ -315,8 +313,8 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = _files(path) if path.is_dir() else [path]
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
-        true_files = true_files or [f for f in files if TRUTH.fullmatch(f.stem) and f != path]
-        files = [f for f in files if f not in true_files and (not TRUTH.fullmatch(f.stem) or f == path)]
+        true_files = true_files or [f for f in files if TRUTH_NAME.fullmatch(f.stem) and f != path]
+        files = [f for f in files if f not in true_files and (not TRUTH_NAME.fullmatch(f.stem) or f == path)]
         if not files:
             raise InputError(
                 "path", str(path), f"must hold files in {', '.join(READERS)}", "Point at the folder of the log."
@@ -356,7 +354,7 @@ def _every_file(path: Path) -> list[Path]:
 def _files(path: Path) -> list[Path]:
     """Files of a folder, and those of a folder per vehicle where it has none itself but a truth."""
     every = _every_file(path)
-    bare = not any(_is_bag(file) or (file.parent == path and not TRUTH.fullmatch(file.stem)) for file in every)
+    bare = not any(_is_bag(file) or (file.parent == path and not TRUTH_NAME.fullmatch(file.stem)) for file in every)
     bare = bare and any(map(is_log, every))
     return sorted(file for file in every if bare or file.parent == path)
 
@@ -391,7 +389,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         times = rows[in_group(rows, group)].drop_duplicates([*keys, "t"]).sort_values("t").groupby(list(keys))["t"]
         return float(times.agg(lambda t: t.diff().median())[times.size() >= FREQUENT_SHARE * times.size().max()].min())
 
-    moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
+    moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR_COLUMNS)
     t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
     span = t.max() - t.min()
     if not span:
@@ -444,8 +442,8 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             f"must name vehicles of the log: {', '.join(ids)}",
             "Rename them, or leave the truth out.",
         )
-    if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
-        rows = rows.assign(t=rows["t"] + DAY * round((steps.mean() - rows["t"].mean()) / DAY))
+    if rows["t"].max() < 2 * DAY_S:  # seconds of the day, as of NMEA without a date, are of the day of the log
+        rows = rows.assign(t=rows["t"] + DAY_S * round((steps.mean() - rows["t"].mean()) / DAY_S))
     axes = 3 if (rows["kind"] == "z").any() else 2
     heights = pd.DataFrame(recording.gnss[0, ..., 2])
     heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")

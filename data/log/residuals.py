@@ -19,7 +19,7 @@ from .read import Log
 TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 """m and rad, of first poses that the truth gives."""
 GATE_STDS = 5.0
-"""Standard deviations of an innovation beyond which the pose filters that check a log leave a measurement out."""
+"""Standard deviations of an innovation beyond which pose filters of real measurements leave one out."""
 WILD_STDS, LEAST_NIS = 5.0, 0.04
 """Multiples of the usual innovation of a vehicle's fixes beyond which one is left out; least square of that."""
 
@@ -182,7 +182,7 @@ def filtered(log: Log) -> Check:
         world = in_world(replace(rec, body=replace(rec.body, heading=heading[None])))
     gap, residual = residual_of(world, x, log.summary.told)
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
-    flat, distance = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
+    flat, distance = distances(gap)
     expected = np.column_stack([both, both / flat**2, both / distance**2])
     expected[:, 1] += heading_variance[links.step, links.observer]
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
@@ -195,6 +195,11 @@ def filtered(log: Log) -> Check:
 def plane(vectors: Floats) -> AnyArray:
     """East and north of vectors (..., 3) as x + iy."""
     return vectors[..., :2] @ [1, 1j]
+
+
+def distances(gap: Floats) -> list[Floats]:
+    """Of vectors (L, 3) m: in the plane and in space, (L,) m, 1 at least."""
+    return [np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3)]
 
 
 def residual_of(world: Recording, x: Floats, told: Sequence[int] = ()) -> tuple[Floats, Floats]:

@@ -24,7 +24,7 @@ from ..cells import (
 from .units import KINDS, Rows, Summary, in_group, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
-UNITS = {"m", "cm", "mm", "rad", "deg", "rate", "raw"}
+UNIT_SUFFIXES = {"m", "cm", "mm", "rad", "deg", "rate", "raw"}
 """Behind the name of a kind, these are no partners."""
 OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
 """Columns of a table of drives."""
@@ -141,7 +141,7 @@ def _of_partner(column: str) -> tuple[str, str] | None:
     kinds = [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")]
     kind = max(kinds, key=len, default="")
     partner = column[len(kind) + 1 :]
-    known = not kind or column in KINDS or partner in UNITS or column.endswith("_std")
+    known = not kind or column in KINDS or partner in UNIT_SUFFIXES or column.endswith("_std")
     return None if known else (kind, partner)
 
 

@@ -9,7 +9,7 @@ import pandas as pd
 from coopoc import InputError
 from coopoc.arrays import Bools
 
-DEGREE, TURN = float(np.pi / 180), float(2 * np.pi) + 1e-3
+DEGREE, MAX_ANGLE_RAD = float(np.pi / 180), float(2 * np.pi) + 1e-3
 
 
 class Kind(NamedTuple):
@@ -38,12 +38,12 @@ KINDS: dict[str, Kind] = {
     "speed_kmh": Kind("odometry", "speed", 1800.0, 1 / 3.6),
     "speed_knots": Kind("odometry", "speed", 972.0, 1.852 / 3.6),
     "yaw_rate": Kind("odometry", "yaw_rate", 35.0),
-    "heading": Kind("heading", "heading", TURN),
+    "heading": Kind("heading", "heading", MAX_ANGLE_RAD),
     "range": Kind("relative", "range"),
-    "azimuth": Kind("relative", "azimuth", TURN),
-    "bearing": Kind("relative", "bearing", TURN),
-    "inclination": Kind("relative", "inclination", TURN / 2),
-    "elevation": Kind("relative", "inclination", TURN / 4, -1.0, float(np.pi / 2)),
+    "azimuth": Kind("relative", "azimuth", MAX_ANGLE_RAD),
+    "bearing": Kind("relative", "bearing", MAX_ANGLE_RAD),
+    "inclination": Kind("relative", "inclination", MAX_ANGLE_RAD / 2),
+    "elevation": Kind("relative", "inclination", MAX_ANGLE_RAD / 4, -1.0, float(np.pi / 2)),
     "message": Kind("message", "message"),
 }
 """Azimuth and heading are anticlockwise from +x (east), compass_deg clockwise from north, bearing anticlockwise from
@@ -51,7 +51,7 @@ the observer's heading, inclination from +z, elevation above the horizon. A unit
 for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "elevation"):
     KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
-LIMITS = {name: kind.limit for name, kind in KINDS.items()}
+KIND_LIMITS = {name: kind.limit for name, kind in KINDS.items()}
 LEAST_VALUES = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 MOST_CODES, LEAP_RATIO, LEAST_MEANT = 3, 1.4, 10
 """Codes for "not measured": most different ones of a kind; ratio to the largest plausible value beyond which a value
@@ -119,7 +119,7 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     in several rows, that are far from what can be meant, or to and from which ranges and speeds leap."""
     own = rows[in_group(rows, "fix", "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
-    size, limit = value.abs(), kind.map(LIMITS)
+    size, limit = value.abs(), kind.map(KIND_LIMITS)
     wrong = (size > limit) | (value < kind.map(LEAST_VALUES)) | ((kind == "range") & (value == 0.0))
     usual = kind.map(size[~wrong].groupby(kind).max())
     near = (size > limit) & (size <= LEAP_RATIO * usual)  # as of an angle in degrees
@@ -164,7 +164,7 @@ def _leaps(ranges: Rows, number: float) -> Bools:
 def check_values(rows: Rows) -> None:
     """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
     kind, value, partner = (rows[name] for name in ("kind", "value", "partner"))
-    limit = kind.map(LIMITS)
+    limit = kind.map(KIND_LIMITS)
     alone = in_group(rows, "relative") & (partner == "")
     deviation = "standard deviation of {kind}"
     for wrong, column, actual, allowed, hint in (

@@ -15,9 +15,9 @@ from coopoc.arrays import Floats, Ints
 from coopoc.kernels.compiling.compile import inside, part, storage
 from coopoc.learned.engine.tile import Index, apart, product
 
-SIZE = 3
+STATE_SIZE = 3
 """Components of state and measurement, m = n = 3."""
-CELLS = SIZE * SIZE
+CELLS = STATE_SIZE * STATE_SIZE
 """Entries of each covariance-like GRU state."""
 SHORTEST_LENGTH = 1e-12
 """Length in m up to which a vector has no direction: its feature is zero and has no gradient."""
@@ -65,7 +65,7 @@ class Columns(NamedTuple):
     lengths: int
 
 
-TOGETHER = ("process", "expected", "prior", "innovation", "prior_copy")
+ADJACENT_FIELDS = ("process", "expected", "prior", "innovation", "prior_copy")
 """Fields that end where the next one begins; the others have room for the last vector of what is written there."""
 _ROWS = (
     "update.weight changes 9 corrected 1 1",
@@ -123,7 +123,7 @@ def plan_of(shapes: Shapes) -> Plan:
     columns, end = {}, 0
     for name in Columns._fields:
         columns[name], width = end, widths.get(name, CELLS)
-        end += width if name in TOGETHER else whole(end + whole(width)) - end
+        end += width if name in ADJACENT_FIELDS else whole(end + whole(width)) - end
     rows, size, places = [], 0, np.empty((3, at), np.int64)
     for name, source, first, target, relu, begins in LAYERS:
         outputs, inputs = sizes[name]

@@ -16,7 +16,7 @@ from ..nets.stack import flatten
 from ..training.clients import Client
 from ..training.fit import Judge
 from ..training.machine import one_core, watched
-from ..training.schedule import STEPS, Schedule
+from ..training.schedule import COUNT_LIMITS, Schedule
 from .combine import FLOAT32, SERVER, Answer, Standing, combine
 from .history import Federation, Round
 from .local import adapt
@@ -42,7 +42,7 @@ class Plan:
     participation: Participation = Participation()
 
     def __post_init__(self) -> None:
-        check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
+        check_fields(self, {"rounds": COUNT_LIMITS, "local_epochs": COUNT_LIMITS})
 
     @property
     def rule(self) -> Rule:

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc import InputError, Ledger
-from coopoc.arrays import instance
+from coopoc import Ledger
+from coopoc.arrays import instance, number
 from coopoc.evaluate.ledger import of_training
 from coopoc.text import short_repr
 
@@ -139,11 +139,11 @@ class Federation:
         counted = [i for i, name in enumerate(self.names) if not out or any(name not in missing for missing in out)]
         return [(self.sizes[i], row.validation_loss[i]) for i in counted or range(len(self.sizes))]
 
-    def after(self, number: int) -> Gain:
-        """The global net after round `number`, 0 being the start."""
-        if not 0 <= number < len(self.history):
-            raise InputError("round", number, f"must be in 0..{len(self.history) - 1}", "See history.")
-        return unflatten(self.history[number].weights, self.like)
+    def after(self, rounds: int) -> Gain:
+        """The global net after so many rounds, 0 being the start."""
+        last = len(self.history) - 1
+        rounds = number("rounds", rounds, 0, last, kind=int, allowed=f"in 0..{last}", hint="See history.")
+        return unflatten(self.history[rounds].weights, self.like)
 
 
 def _or_infinite(loss: float) -> float:

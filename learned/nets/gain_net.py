@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from coopoc.arrays import number, seed_of
 
 from ..engine import rollout as engine
-from ..engine.layers import CELLS, SHORTEST_LENGTH, SIZE
+from ..engine.layers import CELLS, SHORTEST_LENGTH, STATE_SIZE
 from ..engine.optimiser import Moments, Outcome, Update
 from ..training.clients import Batch
 from .gain import Recurrent, size
@@ -62,12 +62,12 @@ class GainNet(Recurrent):
         super().__init__()
         self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
         start_gain = number("start_gain", start_gain, -np.inf)
-        wide, both = SIZE * in_mult, 2 * CELLS
+        wide, both = STATE_SIZE * in_mult, 2 * CELLS
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_of(seed))
-            self.update = nn.Linear(SIZE, wide)
-            self.evolution = nn.Linear(SIZE, wide)
-            self.observation = nn.Linear(2 * SIZE, 2 * wide)
+            self.update = nn.Linear(STATE_SIZE, wide)
+            self.evolution = nn.Linear(STATE_SIZE, wide)
+            self.observation = nn.Linear(2 * STATE_SIZE, 2 * wide)
             self.process = nn.GRUCell(wide, CELLS)
             self.prior = nn.GRUCell(CELLS + wide, CELLS)
             self.prior_to_innovation = nn.Linear(CELLS, CELLS)
@@ -79,7 +79,7 @@ class GainNet(Recurrent):
         self.shapes = tuple((name, tuple(parameter.shape)) for name, parameter in self.named_parameters())
         with torch.no_grad():
             self.gain.weight.mul_(0.1)
-            self.gain.bias.copy_(start_gain * torch.eye(SIZE).flatten())
+            self.gain.bias.copy_(start_gain * torch.eye(STATE_SIZE).flatten())
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
@@ -91,7 +91,7 @@ class GainNet(Recurrent):
 
     def start(self, x0: Tensor) -> Memory:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""
-        unit = torch.eye(SIZE, dtype=x0.dtype).flatten().expand(len(x0), CELLS)
+        unit = torch.eye(STATE_SIZE, dtype=x0.dtype).flatten().expand(len(x0), CELLS)
         return Memory(unit, torch.zeros_like(unit), unit, x0, x0, x0, x0)
 
     def step(self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Memory, Tensor]:
@@ -114,7 +114,7 @@ class GainNet(Recurrent):
         back = self.posterior_hidden(torch.cat([innovation, gain], 1)).relu()
         posterior = self.posterior(torch.cat([prior, back], 1)).relu()
 
-        matrix = torch.where(missing, 0.0, gain).view(-1, SIZE, SIZE)
+        matrix = torch.where(missing, 0.0, gain).view(-1, STATE_SIZE, STATE_SIZE)
         x = x_prior + (matrix @ (fix - x_prior).unsqueeze(-1)).squeeze(-1)
         new = Memory(process, posterior, innovation, x, memory.x, x_prior, fix)
         held = memory._replace(x=x, x_before=memory.x)

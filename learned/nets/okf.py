@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from coopoc import InputError, Recording, Track
-from coopoc.arrays import Floats, check_fields, checked, seed_of
+from coopoc.arrays import Floats, check_fields, checked, refuse, seed_of
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
@@ -56,8 +56,8 @@ class OptimisedKF(Alone):
     def __post_init__(self) -> None:
         for field in ("process_std", "velocity_ratio", "gnss_std"):
             value = checked(field, getattr(self, field), "(3,)", (3,))
-            if not (np.isfinite(value) & (value >= 0)).all():
-                raise InputError(field, getattr(self, field), "must be three numbers >= 0", "Train it with fit_okf.")
+            wrong = ~(np.isfinite(value) & (value >= 0))
+            refuse(field, value, wrong, "must be finite and >= 0", "Take load_method('okf').")
         check_fields(self)
         if min(self.gnss_std) == 0:
             raise InputError("gnss_std", self.gnss_std, "must be > 0", "Assumed noise may not be zero.")
@@ -73,8 +73,7 @@ class OptimisedKF(Alone):
         >>> OptimisedKF((1.0,) * 3, (0.0,) * 3, (1.0,) * 3).start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)[0]
         array([1., 2., 0.])
         """
-        check_interval(interval)
-        return FilterStream(self._motion(float(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
+        return FilterStream(self._motion(check_interval(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
 
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:

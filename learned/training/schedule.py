@@ -10,10 +10,10 @@ import torch
 from coopoc.arrays import Floats, Ints, Limits, check_fields
 
 Epoch = Literal["step", "pass"]
-STEPS, SIZE = (1, 10**7, "> 0"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
+COUNT_LIMITS, POSITIVE_LIMITS = (1, 10**7, "> 0"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
 LIMITS: Limits = {
-    **dict.fromkeys(("epochs", "batch", "checks"), STEPS),
-    **dict.fromkeys(("learning_rate", "clip"), SIZE),
+    **dict.fromkeys(("epochs", "batch", "checks"), COUNT_LIMITS),
+    **dict.fromkeys(("learning_rate", "clip"), POSITIVE_LIMITS),
     "weight_decay": (0.0, sys.float_info.max, ">= 0, and 0 for none"),
 }
 """Of a Schedule's numbers."""

@@ -15,7 +15,17 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import AWAY, CONFIRMED, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
+from coopoc.kernels.gate import (
+    AWAY,
+    CONFIRMED,
+    FIX_GATE,
+    FIXES_TO_RETURN,
+    GATE,
+    HARD_REJECT_FACTOR,
+    LEAK,
+    PATIENCE,
+    SLIP_M2,
+)
 from coopoc.kernels.odometry_fault import DECISIVE
 from coopoc.kernels.stars.cooperative_members import CHANGES, CONTRADICTED, WIDEST
 from coopoc.kernels.stars.cooperative_messages import (
@@ -39,14 +49,14 @@ from coopoc.kernels.stars.otherwise import (
     PRIOR,
     SHARED,
     SIDEWAYS,
-    SLIP_INTERVAL,
-    SLIP_LASTS,
-    SPEED_MEMORY,
+    SLIP_DURATION_S,
+    SLIP_HIDDEN_S,
+    SLIP_INTERVAL_S,
+    SPEED_MEMORY_S,
     SUDDEN,
     TURNS,
-    UNSEEN,
     UNTRUSTED,
-    USUAL,
+    USUAL_SQUARE,
 )
 from coopoc.methods.cooperative_filter import Priors
 from coopoc.methods.odometry_fault import with_odometry
@@ -352,7 +362,7 @@ class Oracle:
     def pace(self, t):
         """The most of late speeds, and its direction."""
         dt, u = self.dt, self.u[t]
-        speed, late = float(np.linalg.norm(u)), self.state.speed * exp(-dt / SPEED_MEMORY)
+        speed, late = float(np.linalg.norm(u)), self.state.speed * exp(-dt / SPEED_MEMORY_S)
         self.state.blind += dt
         if speed > 0.5 * late:
             self.state.course, self.state.blind = u / speed, 0.0
@@ -370,15 +380,15 @@ class Oracle:
         known, fails = self.pending == KNOWN, self.pending > 0
         strange = (p > 0.1 or self.state.squares > n + sqrt(2 * n)) and (fails or known or not self.state.jumped)
         if before is None or not strange:
-            self.state.slips *= 0.0 if n else exp(-dt / SLIP_LASTS)
+            self.state.slips *= 0.0 if n else exp(-dt / SLIP_DURATION_S)
             return
         first, self.state = self.state, before
         rate, shows = (share * self.state.speed) ** 2, self.r[t, self.ego] @ self.white + self.state.shown**2
         self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
-        self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
+        self.step(t, rate * dt**2 + (min(rate * SLIP_HIDDEN_S**2, shows) if p <= 0.5 and dt < SLIP_HIDDEN_S else 0.0))
         self.corrected_now = False
-        prior = p * (1.0 if known else exp(-dt / SLIP_LASTS)) + (1 - p) * min(
-            dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5
+        prior = p * (1.0 if known else exp(-dt / SLIP_DURATION_S)) + (1 - p) * min(
+            dt / (SLIP_DURATION_S if known else SLIP_INTERVAL_S), 0.5
         )
         odds = self.state.score - first.score + (DECISIVE if fails else log(prior / (1 - prior)))
         if odds < 0:
@@ -572,10 +582,10 @@ class Oracle:
         (x, p), most = s.left, HARD_REJECT_FACTOR * gate
         if ("o", self.ego) in b.names and self.life.absent[0] == -inf:
             p += s.driven**2 * np.diag(b.p)[b.at("o", self.ego)].sum() / 3
-        other = ((fix - x) ** 2 / (p + r + SLIP)).sum()
+        other = ((fix - x) ** 2 / (p + r + SLIP_M2)).sum()
         s.evidence = 0.0 if other > gate else max(s.evidence + min(q, most) - other, 0.0)
         near = np.square(b.x[at] - x + np.diag(cov) / (np.diag(cov) + r) * gap).sum() < 3 * p
-        if not near and s.evidence > EVIDENCE * most:
+        if not near and s.evidence > FIXES_TO_RETURN * most:
             if self.speak_for(t, b.x[at], x) > 0:
                 return
             for j in list(s.members):
@@ -645,7 +655,7 @@ class Oracle:
         q = square
         if j == self.ego and len(self.fix_terms(j)) == 1:
             q = float((((gap - s.off[used]) ** 2) / (s.cov[used] + r)).sum())
-        q = min(q, float(gap @ gap) / SLIP)
+        q = min(q, float(gap @ gap) / SLIP_M2)
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
             if q > g.fix_gate and hits < PATIENCE:
@@ -789,7 +799,7 @@ class Oracle:
         if np.isnan(fix).any():
             return False
         for at in votes:
-            if ((fix - at[0]) ** 2 / (2 * r + self.state.spread + SLIP)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
+            if ((fix - at[0]) ** 2 / (2 * r + self.state.spread + SLIP_M2)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
                 at[1] += 1
                 break
         else:
@@ -999,7 +1009,7 @@ class Oracle:
             if not vague:
                 self.count(min(q, GATE), logdet, 1)
                 hits[c] = hits[c] + 1 if g.fix_gate and q > GATE else 0
-                self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
+                self.learn(c, min(q, SUDDEN) - USUAL_SQUARE, r[c] / total[c])
         s.vague.discard(j)
 
     def take(self, t, j):

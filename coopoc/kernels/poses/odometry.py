@@ -9,7 +9,7 @@ from ..gate import INITIAL_LOCKOUT
 from ..motion import MotionNoise, keep_pace, process_variance
 from .scalar_update import HEADING, OFFSET, Poses, Three
 
-UNKNOWN_HEADING = math.pi**2 / 3.0
+UNKNOWN_HEADING_RAD2 = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
 
 
@@ -138,6 +138,6 @@ def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> No
         poses.pace[0, member + i] = own[4 + i] * own[4 + i]
     for i in range(4):
         poses.x[member + i] = 0.0 if math.isnan(own[i]) else own[i]
-        poses.cov[member + i, member + i] = noise.flat if i < HEADING else UNKNOWN_HEADING
+        poses.cov[member + i, member + i] = noise.flat if i < HEADING else UNKNOWN_HEADING_RAD2
     for i in range(4, d):
         poses.cov[member + i, member + i] = noise.lasting[i - 4]

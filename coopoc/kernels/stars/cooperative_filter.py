@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, inner_product, negate, store, subtract
-from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP, remember
+from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import doubt_ego, fix_terms, goes_on, receive, trust, use_fix
@@ -114,14 +114,14 @@ from .otherwise import (
     LEAST_COUNTED,
     LIKELY,
     LOUDEST_NOISE,
-    MEMORY,
     MOST_EXCESS,
     NOW,
     NUMBERS,
     PENDING,
-    SLIP_LASTS,
+    SLIP_DURATION_S,
     SLIPPED,
     SQUARES,
+    STAR_MEMORY_S,
     Tries,
     adapt,
     average,
@@ -280,7 +280,7 @@ def step(
     elif f.ego[NUMBERS] > 0.0:
         f.ego[SLIPPED] = 0.0
     else:
-        f.ego[SLIPPED] *= math.exp(-own[DT] / SLIP_LASTS)
+        f.ego[SLIPPED] *= math.exp(-own[DT] / SLIP_DURATION_S)
     remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
@@ -300,7 +300,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
     average(alone, model)
     doubts[ALONE_FOR] -= own[DT]
     if not math.isnan(own[FIX]):
-        keep = math.exp(-own[DT] / MEMORY)
+        keep = math.exp(-own[DT] / STAR_MEMORY_S)
         doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, model, own) - gap_to_fix(alone, model, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
         answers = vector_at(alone.ego, ANSWER // 3), vector_at(f.ego, ANSWER // 3)
@@ -424,7 +424,7 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
         spread += left[6] ** 2 * (g.p[i, i] + g.p[i + 1, i + 1]) / 3.0
     for c in range(3):
         p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
-        other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP)
+        other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP_M2)
         gain += p / (3.0 * (p + r))
         apart += (g.x[c] - left[c] + p / (p + r) * h.three[GAP + c]) ** 2  # where this fix would put it
     gate = max(model.fix_gate, FIX_GATE)
@@ -447,7 +447,7 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
         widen(g, 0, spread)
         f.member[0, LOCKED] = 0.0
     if what != KEEP:
-        left[3] = NOTHING
+        left[3] = NOT_REMEMBERED_M2
     return what == BACK
 
 

@@ -8,7 +8,7 @@ from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import add, add_diagonal, inner_product, scale, store, subtract
 from ..dead_reckoning import ROUNDING
-from ..gate import FIX_GATE, NOTHING, PATIENCE, SLIP, count, inflation
+from ..gate import FIX_GATE, NOT_REMEMBERED_M2, PATIENCE, SLIP_M2, count, inflation
 from .cooperative_members import dismiss, replace_implausible_velocity, stand
 from .cooperative_state import (
     AGE,
@@ -283,7 +283,7 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
             correct(g, h, 1.0)
         return 0.0 if supported else 1.0
     gap = vector_at(h.three, GAP // 3)
-    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / SLIP)
+    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / SLIP_M2)
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
@@ -426,7 +426,7 @@ def doubt_ego(f: Filter, model: Model) -> None:
     widen(g, 0, spread)
     set_trust(f, ego, 0.0, TAU**2 + model.own)
     f.status[ego, REVOKED] += 1.0
-    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], f.who[0, REJECTED] = NOTHING, 0.0, 0.0, 0
+    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], f.who[0, REJECTED] = NOT_REMEMBERED_M2, 0.0, 0.0, 0
 
 
 @part

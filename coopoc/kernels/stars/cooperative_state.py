@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
 from ..compiling.small import add, inner_product, load, store, subtract
-from ..gate import CONFIRMED, FIX_GATE, NOTHING, PATIENCE, Vector, vote
+from ..gate import CONFIRMED, FIX_GATE, NOT_REMEMBERED_M2, PATIENCE, Vector, vote
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -34,31 +34,37 @@ from .gaussian import (
 from .messages import vector_at
 
 FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, OWN = 0, 3, 6, 9, 12, 13, 16, 17
-"""Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
+"""Fields of the ego's row: fix m (NaN for none), its variance m^2, motion m and its variance m^2, three numbers each;
+dt s; the part m of the motion by which fixes have corrected it, and the variance m^2 that this adds."""
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
-"""Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
-variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
+"""Fields of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none), mean of its fixes m and
+its variance m^2, odometer (sum of all motions) m, velocity m/s, variance of one step's motion m^2 and of a fix m^2."""
 TRUSTED, COUNT, USED, MEAN, LAST, PACE, SINCE, SLIPS = 0, 1, 2, 3, 6, 15, 21, 22
 REVOKED, LOUDER, NOISE, STATUS = 23, 24, 25, 26
-"""Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
-that was used was sent s (-inf for none), mean innovation m, and
-SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
-motion with it m^2, when that was s (-inf for never), how many in a row were not, how often it lost trust, by which
-share of what is assumed the variance of its velocities is more, and the variance m^2 of the noise of a fix in the mean
-innovation, axes together."""
+"""Fields of a vehicle's status:
+
+- TRUSTED: whether its fixes are assumed to be right.
+- COUNT, MEAN, NOISE: number of fixes in the mean innovation, that mean m, and the variance m^2 of a fix's noise in it
+  (sum of the axes).
+- USED, LAST: when its last used message was sent, s (-inf for none), and SOLO, SOLO_VARIANCE and ODOMETER of it.
+- PACE, SINCE, SLIPS: its last plausible velocity m/s with the variance of one step's motion m^2, when that was s (-inf
+  for never), and how many implausible ones have followed.
+- REVOKED: how often it lost trust.
+- LOUDER: relative increase of the variance of its velocities over the assumed one.
+"""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 WILD = 32.0
-"""Squared normalised distance from which a velocity is implausible, or an error of fixes beyond doubt."""
+"""Squared normalised distance from which a velocity is implausible, or an error of fixes is certain."""
 ESTABLISHED, MAX_LOCKOUT = 60.0, 0.99 * PATIENCE
-"""s of agreement with fixes after which a position was no wrong start, and its count of lock-out at which fixes that
-contradict it are taken for noisier ones: it is not left."""
+"""s of agreement with fixes after which a position is no wrong start, and the largest lock-out count of such a one: it
+is kept, and fixes that contradict it count as noisier."""
 TAU = 20.0
-"""m, standard deviation of an error of a receiver of which nothing is known."""
+"""m, prior standard deviation of a receiver's error."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
 FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 13
-"""Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
+"""Kinds of numbers with a level, after ranges, azimuths and inclinations; number of these kinds, and of errors."""
 
 
 class Model(NamedTuple):
@@ -122,15 +128,24 @@ NO_VOTES = (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, BARE, LEFT = 20, 26, 32, 38, 51, 54, 63, 66
 AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, EGO = 73, 74, 75, 76, 84, 93, 94, 97
-"""Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
-of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
-level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
-is otherwise than assumed, and position m and covariance m^2; the variances of that before `lasting` adds to them, and
-of the ego as it moves on; and where it would be m, had fixes not led it away, the variance of that m^2, NOTHING for
-none, the two numbers of `gate.remember` on it, and how far the ego has driven since m; for how much longer s fixes have
-agreed with its position than not; s since the last fix; by how many m^2 a step's motion is more uncertain where this
-try takes it as fixes correct it, else 0; eight numbers of `lasting`; nine of `gate.vote`; and by how many m^2, axes
-together, the ego's position is more uncertain than its covariance says; and the answer m less the position."""
+"""Fields of the ego:
+
+- STEPS, CLOCK, SPAN: number of the step; time s, and time since the last step s.
+- MADE, WHOLE: of its variance m^2 (sum of the axes) the part that the level of motion makes, and all of it.
+- SLIPPING: fifteen numbers of `otherwise` on slips.
+- LEVEL, SLOPE, INFORMATION: by kind of number, the logarithm of its level, this step's sum of its derivatives, and its
+  information.
+- TOLD, ANSWER, COVARIANCE: output. FOUND numbers of `otherwise.average`, position m and covariance m^2.
+- BARE: variances m^2 of ANSWER before `lasting` adds to them, and after the motion since then.
+- LEFT: the remembered position m that fixes led away from, its variance m^2 (NOT_REMEMBERED_M2 for none), the two
+  numbers of `gate.remember`, and the distance driven since, m.
+- AGREED: s for which fixes have agreed with the position, less s for which they have not.
+- SINCE_FIX: s since the last fix.
+- CORRECTED: m^2 that fixes add to the variance of this step's motion where they correct it, else 0.
+- ERRORS, VOTES: eight numbers of `lasting`; nine of `gate.vote`.
+- UNSAID: m^2 (sum of the axes) by which the position is more uncertain than its covariance says.
+- OFFSET: ANSWER less the position, m.
+"""
 
 
 class Filter(NamedTuple):
@@ -214,7 +229,7 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
             f.status[j, c] = 0.0
         f.status[j, TRUSTED] = 1.0 if model.fix_gate == 0.0 or j == ego else 0.0
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
-    f.ego[LEFT + 3] = NOTHING
+    f.ego[LEFT + 3] = NOT_REMEMBERED_M2
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
     insert(f.g, 0, PLACE)
     insert_error(f.g, 0, COMMON, (model.common, model.common, model.common))

@@ -20,8 +20,8 @@ from ..gate import (
     FIX_GATE,
     INITIAL_LOCKOUT,
     LEAK,
-    NOTHING,
-    UNSEEN,
+    NO_FIX_M2,
+    NOT_REMEMBERED_M2,
     distance,
     gain_of,
     gated_update,
@@ -68,7 +68,7 @@ class Gates(NamedTuple):
 def gates_within(most: int) -> Gates:
     """Room for `most` members."""
     before = np.zeros((len(BEFORE), LANES))
-    before[3:12:4] = NOTHING
+    before[3:12:4] = NOT_REMEMBERED_M2
     state = np.zeros((2, 13 * most, LANES))
     return Gates(state[0], state[1], before, np.zeros((len(VOTES), LANES)))
 
@@ -117,7 +117,7 @@ def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
         polar = load(star.relative, k, RELATIVE)
         gap, sent = subtract(position_of(star, k), add(at, vector(polar))), variance_of(star, k)
         q = distance(gap, add_diagonal(zeros(o, BLOCK), add(noise, sent)))
-        agree = agree + choose(o + FIX_GATE - q, choose(o + UNSEEN - sent[0], whole(polar), o), o)
+        agree = agree + choose(o + FIX_GATE - q, choose(o + NO_FIX_M2 - sent[0], whole(polar), o), o)
     return agree
 
 
@@ -134,12 +134,12 @@ def go_back(star: Star, gates: Gates, state: Floats, n: int) -> Lanes:
     if not left <= o:
         more = supporters(star, n, at, (ego[0], ego[4], ego[8])) - supporters(star, n, fix, zeros(o, ROW))
         left = choose(more, o, left)
-    if q <= o + FIX_GATE and o + NOTHING <= spread[0] and left <= o:
+    if q <= o + FIX_GATE and o + NOT_REMEMBERED_M2 <= spread[0] and left <= o:
         return o
     gap, other = subtract(there, at), distance(subtract(fix, there), add_diagonal(spread, variance))
     apart, wide, gain = inner_product(gap, gap), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
     what, evidence, since = remember(q, other, FIX_GATE, gain, apart, wide, memory[12], memory[13])
-    begins, back, flat = what - 0.5, what - 1.5, o + NOTHING
+    begins, back, flat = what - 0.5, what - 1.5, o + NOT_REMEMBERED_M2
     nothing = add_diagonal(zeros(o, BLOCK), (flat, flat, flat))
     kept = choose_each(back, nothing, choose_each(begins, ego[:9], choose_each(what + 0.5, spread, nothing)))
     store(gates.before, 0, (*choose_each(begins, at, there), *kept, evidence, since))

@@ -29,15 +29,14 @@ from ..geometry import Numbers
 from .messages import BLOCK, ROW, block_at, vector_at
 
 PLACE, ERROR, TURN, FRESH, COMMON, COMPASS, RANGED = range(7)
-"""Kinds of vectors: position m, error of its fixes m, (heading rad, scale, nothing) by which its odometry errs, and
-scratch of `insert_from_measurement`; of the ego the error m that all fixes share, and (bias, noise of this step) of its
-compass, rad, with the offset m of its ranges, and the error of their scale; of a neighbour the offset m of ranges to
-it."""
+"""Kinds of vectors. Of every member: position m; error of its fixes m; errors of its odometry (heading rad, scale,
+unused); scratch of `insert_from_measurement`. Of the ego: error m common to all fixes; (compass bias rad, compass noise
+of this step rad, offset of its ranges m); scale error of its ranges. Of a neighbour: offset m of the ranges to it."""
 KINDS, TERMS = 7, 6
 ABSENT = -1
 IDENTITY: Numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-HARD_REJECT_FACTOR = 4.0
-"""Times the gate: from there on a number is not only down-weighted."""
+STRONG_INFLATION_FACTOR = 4.0
+"""Multiple of the gate beyond which a measurement's variance is inflated by another factor of 100."""
 
 
 class Gaussian(NamedTuple):
@@ -206,10 +205,10 @@ def expect(h: Rows, c: int, z: float, variance: float) -> None:
 
 @inside
 def weight(q: float, gate: float) -> float:
-    """Share of its information that a number keeps: 1 / (inflation of the innovation's covariance)."""
+    """Share of its information that a measurement keeps: 1 / (inflation of the innovation's covariance)."""
     if gate == 0.0 or not q > gate:
         return 1.0 + 0.0 * q
-    return gate / q * (0.01 if q > HARD_REJECT_FACTOR * gate else 1.0)
+    return gate / q * (0.01 if q > STRONG_INFLATION_FACTOR * gate else 1.0)
 
 
 @part
@@ -249,8 +248,8 @@ def innovate(g: Gaussian, h: Rows) -> float:
     """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
 
     `gain` is U = P H^T L^-T, S = L L^T the innovation's covariance. Where the squared normalised innovation q of a row
-    exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds HARD_REJECT_FACTOR times
-    the gate.
+    exceeds its gate, its variance is multiplied by q / gate. Beyond STRONG_INFLATION_FACTOR gates it is multiplied by
+    100 as well.
     """
     project(g, h)
     if h.three[CURVE] > 0.0:
@@ -274,10 +273,11 @@ def innovate(g: Gaussian, h: Rows) -> float:
 
 @inside
 def bend(h: Rows) -> None:
-    """Add what range, azimuth and inclination are from linear: the variance of their terms of second order.
+    """Add the variance of the second-order terms of range, azimuth and inclination, which linear rows leave out.
 
-    At a distance of d, u beyond and v and w aside of where they are linear, they are, in m,
-    d + u + (v^2 + w^2) / 2 d, v - u v / d and w - u w / d; of each error what its own number leaves counts.
+    At a distance of d, u beyond and v and w beside the point of linearisation, they are, in m,
+    d + u + (v^2 + w^2) / 2 d, v - u v / d and w - u w / d. Of each error the part counts that its own measurement
+    leaves.
     """
     u = v = w = 0.0
     for c in range(3):

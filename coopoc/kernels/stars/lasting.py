@@ -45,7 +45,7 @@ from .messages import vector_at
 RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
 """Of the ego's fixes: sums of their errors m on each axis and of 1, fading; s since the last one; and number, sum and
 sum of squares of products m^2 of an error and the mean of those before it."""
-SECOND, MEMORY = 1.0, 100.0
+ERROR_MEMORY_S, PRODUCT_MEMORY_S = 1.0, 100.0
 """s, in which an error fades, and in which products do."""
 FEWEST = 3
 """Vehicles whose errors show what is usual, and fixes in the mean of one that is trusted."""
@@ -91,10 +91,10 @@ def remember_error(f: Filter, own: Floats) -> None:
     ego, g, product = f.ego, f.g, 0.0
     ego[WAITED] += own[DT]
     for i in range(PAIRS, PRODUCTS2 + 1):
-        ego[i] *= math.exp(-own[DT] / MEMORY)
+        ego[i] *= math.exp(-own[DT] / PRODUCT_MEMORY_S)
     if not f.member[0, OUT + 3] >= 1.0:
         return
-    keep = math.exp(-min(ego[WAITED] / SECOND, 1.0))
+    keep = math.exp(-min(ego[WAITED] / ERROR_MEMORY_S, 1.0))
     for c in range(3):
         error = own[FIX + c] - g.x[c]
         for kind in (ERROR, COMMON):
@@ -115,8 +115,8 @@ def add_lasting(f: Filter, model: Model, own: Floats) -> None:
     of fixes that last: those of the ego, where pairs within two seconds count as one, or the mean of the star's."""
     for i in range(9):
         f.ego[COVARIANCE + i] *= 1.0 + f.ego[UNSAID] / max(f.ego[WHOLE], 1e-300)
-    n, seconds = max(f.ego[PAIRS], 1.0), min(max(f.ego[CLOCK], SECOND), MEMORY)
-    c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / seconds, 1.0 / n)
+    n, seconds = max(f.ego[PAIRS], 1.0), min(max(f.ego[CLOCK], ERROR_MEMORY_S), PRODUCT_MEMORY_S)
+    c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * ERROR_MEMORY_S / seconds, 1.0 / n)
     if model.forget == 0.0:
         return
     stated = f.ego[COVARIANCE] + f.ego[COVARIANCE + 4] + f.ego[COVARIANCE + 8]

@@ -40,7 +40,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
 from ..compiling.small import add, inner_product, scale, store
-from ..odometry_fault import DECISIVE
+from ..odometry_fault import DECISIVE, SPEED_MEMORY_S
 from .cooperative_state import (
     AGREED,
     ANSWER,
@@ -107,7 +107,7 @@ from .gaussian import (
 from .messages import vector_at
 
 HEADING, SCALE, OF_COMPASS, OF_RANGE, OF_SCALE, SLIPS, ALONE, LEVELS = range(8)
-"""Places in TOLD: the ego's errors, rad, 1, rad, m, 1, whether it slips, whether it has left its star, and the
+"""Indices in TOLD: the ego's errors (rad, 1, rad, m, 1), whether it slips, whether it has left its star, and the
 factors of standard deviations."""
 
 
@@ -278,10 +278,10 @@ SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COU
 the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, whether
 fixes have jumped; for how long s it has not measured its direction, and that; and the innovation of the last fix m."""
 SIDEWAYS, TURNS, LEFT_OPEN = 0.03, 0.3, 5.0
-"""Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then; and the
-most of that variance, in those of a motion as fixes correct it."""
-SLIP_LASTS, SLIP_INTERVAL, SPEED_MEMORY, UNSEEN = 3.0, 3000.0, 10.0, 1.0
-"""s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
+"""Share of a slip's variance across the way, which is some ten degrees; rad/s by which a slipping vehicle may turn; largest
+slip variance over that of a motion which fixes correct."""
+SLIP_DURATION_S, SLIP_INTERVAL_S, SLIP_HIDDEN_S = 3.0, 3000.0, 1.0
+"""Mean s of a slip and from one to the next; s until fixes show one."""
 
 
 class Tries(NamedTuple):
@@ -296,24 +296,29 @@ class Tries(NamedTuple):
     doubts: Floats
 
 
-EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, ALIKE, DOUBTS = range(7)
-"""Of the star as a whole: sums over the ego's fixes, fading in MEMORY s, of how much larger their squared normalised
-distance from the star's estimate is than from that of the ego alone, and of 1; for how many s the latter counts from
-now on, and counted last; sum of MORE, m^2, since the odometry has failed, KNOWN once it was taken to; and fading, too,
-by how much nearer neighbours put the ego to the estimate alone than to the star's, as squared normalised distances."""
+EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, ALIKE, STAR_DOUBTS = range(7)
+"""Evidence against the star as a whole:
+
+- EXCESS, COUNTED: sums over the ego's fixes, fading in STAR_MEMORY_S, of the squared normalised distance from the
+  star's estimate less that from the estimate of the ego alone, and of 1.
+- ALONE_FOR, ALONE_LAST: s for which the estimate alone counts from now on, and for which it counted last.
+- PENDING: sum of MORE, m^2, since the odometry failed; KNOWN once that is certain.
+- ALIKE: fading as well, how much nearer neighbours put the ego to the estimate alone than to the star's, as squared
+  normalised distances.
+"""
 KNOWN = -1.0
-MEMORY, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
-"""s; fixes, and the mean excess, from which the star is left; the most that one distance counts."""
+STAR_MEMORY_S, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
+"""Time constant s; number of fixes and mean excess from which the ego leaves its star; largest distance that counts."""
 LOUDEST_NOISE, AGAINST, FIRST_ALONE = 2.9, 20.0, 20.0
-"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; ALIKE from which neighbours speak
-against the star; s alone for the first time."""
+"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; ALIKE from which neighbours contradict
+the star; s alone for the first time."""
 
 
 @storage
 def new_tries(slots: int, vehicles: int) -> Tries:
     """Memory for as many members and vehicles."""
     other, alone = new_filter(slots, vehicles), new_filter(slots, vehicles)
-    return Tries(other, np.zeros(OWN), np.zeros((slots, WIDTH)), alone, np.zeros(OWN), np.zeros(DOUBTS))
+    return Tries(other, np.zeros(OWN), np.zeros((slots, WIDTH)), alone, np.zeros(OWN), np.zeros(STAR_DOUBTS))
 
 
 @part
@@ -344,9 +349,9 @@ def corrected_motion(f: Filter, own: Floats, more: float) -> None:
 
 @part
 def remember_speed(f: Filter, own: Floats) -> None:
-    """The most of late speeds, and its direction: wheels that are locked measure none."""
+    """Remember the largest recent speed and its direction: locked wheels measure none."""
     u = scale(add(vector_at(own, MOTION // 3), vector_at(own[BY_FIXES:], 0)), 1.0 / own[DT])
-    speed, late = math.sqrt(inner_product(u, u)), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY)
+    speed, late = math.sqrt(inner_product(u, u)), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY_S)
     f.ego[BLIND] += own[DT]
     if speed > 0.5 * late:
         f.ego[BLIND] = 0.0
@@ -356,8 +361,9 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 @part
 def show(f: Filter) -> None:
-    """After `innovate`: how far the ego may have gone unseen, the distance of its fix as far as that grew no faster
-    than the ego drives and fixes err; if faster, they have jumped until they are near again, and that is no slip."""
+    """After `innovate`: how far the ego may have slipped unmeasured. That is the distance of its fix, if it grew no
+    faster than the ego drives and fixes err. If it grew faster, the fixes have jumped, which is no slip, until they are
+    near again."""
     far, noise, before = 0.0, 0.0, 0.0
     for c in range(3):
         before += f.ego[BEFORE + c] ** 2
@@ -373,14 +379,15 @@ def show(f: Filter) -> None:
 
 @part
 def slip(f: Filter, model: Model, own: Floats) -> None:
-    """Widen the ego along its way, if this try assumes that it slips; a slip that begins now may have lasted for UNSEEN
-    s, by no more than fixes err and have shown. Where fixes correct the motion, what they leave open is the most."""
+    """Add variance along the ego's way if this try assumes that it slips. A slip that begins now may have lasted for
+    SLIP_HIDDEN_S already, but not farther than fixes err and have shown; where fixes correct the motion, not farther
+    than these leave open."""
     if f.ego[NOW] == 0.0:
         return
     rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
     variance = rate * own[DT] ** 2
-    if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
-        variance += min(rate * UNSEEN**2, sum(vector_at(own, FIX_VARIANCE // 3)) + f.ego[SHOWN] ** 2)
+    if f.ego[SLIPPED] <= 0.5 and own[DT] < SLIP_HIDDEN_S:
+        variance += min(rate * SLIP_HIDDEN_S**2, sum(vector_at(own, FIX_VARIANCE // 3)) + f.ego[SHOWN] ** 2)
     if f.ego[CORRECTED] > 0.0:
         variance = min(variance, LEFT_OPEN * f.ego[CORRECTED])
     widen(f.g, 0, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
@@ -406,8 +413,8 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
 
 @part
 def surprised(f: Filter, fails: bool) -> bool:
-    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped; not
-    for fixes that jumped while odometry does not fail."""
+    """Whether the first try's innovations are larger than usual by a standard deviation, or the ego may be slipping.
+    Fixes that jumped do not count while odometry does not fail."""
     n = f.ego[NUMBERS]
     strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
     return strange and (f.ego[JUMPED] == 0.0 or fails)
@@ -415,27 +422,27 @@ def surprised(f: Filter, fails: bool) -> bool:
 
 @part
 def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> float:
-    """Probability of a slip, after both tries of a step, by that before it, or by the evidence of an odometry that
-    `fails`; once that is known, it does not end by itself."""
-    stays = 1.0 if known else math.exp(-dt / SLIP_LASTS)
-    begins = min(dt / (SLIP_LASTS if known else SLIP_INTERVAL), 0.5)
+    """Probability of a slip after both tries of a step, from that before the step, or from the evidence that odometry
+    `fails`. Once a failure is known, it does not end by itself."""
+    stays = 1.0 if known else math.exp(-dt / SLIP_DURATION_S)
+    begins = min(dt / (SLIP_DURATION_S if known else SLIP_INTERVAL_S), 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)
 
 
-SUDDEN, USUAL = 5.0, 0.95
-"""Most of a squared normalised innovation that counts, and the mean of what counts of one number that is as assumed."""
+SUDDEN, USUAL_SQUARE = 5.0, 0.95
+"""Largest squared normalised innovation that counts, and the mean of so clipped ones where the noise is as assumed."""
 MIN_LEVEL, MAX_LEVEL, MAX_LEVEL_CHANGE = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
 SHARED = 0.5
-"""Share of what successive innovations of fixes have in common that is motion's, where odometry surely errs: a receiver
-that drifts looks the same."""
+"""Share of the common part of successive fix innovations that is ascribed to motion where odometry surely errs: a
+drifting receiver looks the same."""
 PRIOR = 10.0
-"""Information that the assumed level counts as: that of twenty numbers."""
+"""Information of the prior of a level at its assumed value: that of twenty innovations."""
 UNTRUSTED, AGREEING = 30.0, 10.0
-"""Times the variance of the motion of a vehicle whose fixes are not trusted, until so many of its messages agree with
-the error that these are found to have: what it sends may all be wrong."""
+"""Factor of the motion variance of a vehicle whose fixes are not trusted, and the number of its messages that must
+agree with the estimated error of these fixes to end it: all that it sends may be wrong."""
 
 
 @part
@@ -517,7 +524,7 @@ def learn_fix(f: Filter, model: Model, kind: int) -> None:
 def learn_relative(f: Filter, c: int) -> None:
     """Count the innovation of a component of a relative measurement."""
     h = f.h
-    s, more = h.three[VARIANCE + c] + h.matrix[COV + 4 * c], min(h.three[Q + c], SUDDEN) - USUAL
+    s, more = h.three[VARIANCE + c] + h.matrix[COV + 4 * c], min(h.three[Q + c], SUDDEN) - USUAL_SQUARE
     learn(f, c, more, h.three[VARIANCE + c] / s, 1.0)
 
 

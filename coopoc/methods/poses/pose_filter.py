@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, check_fields, checked, number
+from ...arrays import Bools, Floats, Ints, check_fields, checked, number, refuse
 from ...errors import InputError
 from ...kernels.compiling.waiting import clock
 from ...text import short_repr
@@ -102,8 +102,8 @@ class PoseFilter:
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
-        if not (checked("spread", self.spread or SPREAD, "(4,)", (4,)) > 0).all():
-            raise InputError("spread", self.spread, "must be > 0", "Give m, m, m and rad.")
+        spread = checked("spread", self.spread or SPREAD, "(4,)", (4,))
+        refuse("spread", spread, ~(spread > 0), "must be > 0", "Give m, m, m and rad.")
         if not self.name:
             self.__dict__["name"] = f"pose-{self.unit if self.fusion == 'joint' else self.fusion}"
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of, remade
+from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of, refuse, remade
 from ...errors import InputError
 from .inputs import (
     check_constants,
@@ -292,11 +292,8 @@ class Constraint:
             except ValueError:
                 allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
                 raise InputError(name, side.shape, allowed, "Give one bound per component.") from None
-        wrong = ~(self.lower <= self.upper)  # of NaN, too
-        if wrong.any():
-            bad = np.argwhere(wrong)[0]
-            bad_row = f"[{self.lower[tuple(bad)]}, {self.upper[tuple(bad)]}] in row {bad[0]}"
-            raise InputError(f"bounds of {self.kind}", bad_row, "must have lower <= upper", "No point can satisfy it.")
+        wrong, field = ~(self.lower <= self.upper), f"lower bound of {self.kind}"  # of NaN, too
+        refuse(field, self.lower, wrong, "must be at most the upper one: lower <= upper", "No point can satisfy it.")
         if not bounded(self).any():
             raise InputError(f"bounds of {self.kind}", "none", "must bound something", "Leave the constraint out.")
 

@@ -113,19 +113,16 @@ def check_rotations(field: str, rotation: Floats) -> None:
 
 def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple[int, int]) -> Floats:
     """std as (M or 1, size): > 0, angles at most pi."""
-    array, size = checked(f"std of {measurement.name}", std), shape[-1]
+    field, size = f"std of {measurement.name}", shape[-1]
+    array = checked(field, std)
     wide = np.broadcast_to(array, (1, size)) if array.ndim < 2 and array.size in (1, size) else array
     if wide.ndim != 2 or wide.shape[1] != size or len(wide) not in (1, shape[0]):
         allowed = f"must have shape ({size},) or {shape}"
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
-    if not (wide > 0).all():
-        hint, bad = "Give standard deviations; infinity means no information.", np.argwhere(~(wide > 0))[0]
-        actual = f"{wide[tuple(bad)]} in row {bad[0]}"
-        raise InputError(f"std of {measurement.name}", actual, "must be > 0", hint)
+    refuse(field, wide, ~(wide > 0), "must be > 0", "Give standard deviations; infinity means no information.")
     kept = measurement.kept(3 if size == len(measurement.components) else 2)
     angles = wide[:, [measurement.components[k] in ("angle", "turn") for k in kept]]
-    if (np.isfinite(angles) & (angles > np.pi)).any():
-        raise InputError(f"std of {measurement.name}", angles.max(), "must be <= pi rad", "Angles are in radians.")
+    refuse(field, angles, np.isfinite(angles) & (angles > np.pi), "must be <= pi rad", "Angles are in radians.")
     return frozen(wide)
 
 
@@ -136,6 +133,6 @@ def check_root(measurement: Measurement, root: npt.ArrayLike, shape: tuple[int, 
     if array.ndim != 3 or array.shape[1:] != (size, size) or len(array) not in (1, shape[0]):
         allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"
         raise InputError(f"sqrt_information of {measurement.name}", array.shape, allowed, "W with W^T W = cov^-1.")
-    if not np.isfinite(array).all():
-        raise InputError("sqrt_information", "not finite", "must be finite", "Invert a positive definite covariance.")
+    hint = "Invert a positive definite covariance."
+    refuse("sqrt_information", array, ~np.isfinite(array), "must be finite", hint)
     return frozen(array)
