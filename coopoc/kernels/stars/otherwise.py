@@ -278,8 +278,8 @@ SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COU
 the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, whether
 fixes have jumped; for how long s it has not measured its direction, and that; and the innovation of the last fix m."""
 SIDEWAYS, TURNS, LEFT_OPEN = 0.03, 0.3, 5.0
-"""Share of a slip's variance across the way, which is some ten degrees; rad/s by which a slipping vehicle may turn; largest
-slip variance over that of a motion which fixes correct."""
+"""Share of a slip's variance across the way, which is some ten degrees; rad/s by which a slipping vehicle may turn;
+largest variance of a slip over that of a motion which fixes correct."""
 SLIP_DURATION_S, SLIP_INTERVAL_S, SLIP_HIDDEN_S = 3.0, 3000.0, 1.0
 """Mean s of a slip and from one to the next; s until fixes show one."""
 
