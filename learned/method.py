@@ -13,7 +13,7 @@ from coopoc.arrays import Floats, check_fields
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.methods.gaps import in_stretches
-from coopoc.methods.kalman import known_start, solo_track
+from coopoc.methods.kalman import solo_track, start_of
 from coopoc.methods.track import Alone, Track
 from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
@@ -71,8 +71,7 @@ class LearnedGain(Alone):
         """Estimates of the egos, all runs at once; `notes` say where fixes contradict them."""
         began, columns = clock(), check_recording(recording).columns(egos)
         fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
-        origin, first = fixes[:, :1], fixes[:, 0]
-        x0 = first if self.x0 is None else known_start(self.x0, first.shape)
+        origin, x0 = fixes[:, :1], start_of(self.x0, fixes[:, 0])
         lanes = _lanes(fixes[:, 1:] - origin), _lanes(speeds[:, 1:]), _lanes(x0[:, None] - origin)[:, 0]
         with one_core(), torch.inference_mode():
             moved = self.model(*lanes, recording.dt).numpy().astype(np.float64)

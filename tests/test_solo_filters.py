@@ -29,8 +29,9 @@ def test_noise_of_fixes_need_not_be_known(std):
 
 
 def test_bad_settings_are_named(crossing):
-    with refused("^x0 = "):
-        Kalman(x0=np.zeros((2, 3)))(gaps(crossing, absent=False))
+    for shape in ((2, 3), (9, 1, 3)):
+        with refused("^x0 = "):
+            Kalman(x0=np.zeros(shape))(gaps(crossing, absent=False))
     with refused("^velocity_floor = "):
         Kalman(NoiseModel.nominal(Sensors(velocity_floor=0.0)))(gaps(crossing, absent=False))
 

@@ -57,9 +57,9 @@ def posterior_bound(
         ego: column or id.
         v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
-        past: of an ego that knows the fixes and velocities of vehicles before they come into its star, too, as messages
-            bring it that carry sums since departure. It is never above the star's bound, and equal to it while the same
-            neighbours stay.
+        past: the bound of an ego that also knows the fixes and velocities of neighbours from before they joined its
+            star, as messages with sums since departure tell it. It is never above the star's bound, and equal to it
+            while the same neighbours stay.
         recording: of this drive, such as `observe(..., remove_outliers=True)`: a fix, a range or an angle that it lacks
             (NaN) is not measured, and the bound is the mean over its runs. Default: all is measured.
 
@@ -110,9 +110,9 @@ def pose_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landma
     """Bound covariances of (x, y, z, heading, ...) of all vehicles from all that any measures, filtering.
 
     J_t = (F_t J_{t-1}^-1 F_t^T + G_t Q_t G_t^T)^-1 + H_t^T R^-1 H_t (Tichavsky, Muravchik, Nehorai 1998) with the
-    derivatives of `PoseFilter`'s motion and measurements at the truth. An error that lasts and acts is one number more,
-    in this order: the speed's scale, the yaw rate's bias, the compass's bias. Nothing is known of first positions, of
-    first headings that they lie within a turn. There are no outliers in it.
+    derivatives of `PoseFilter`'s motion and measurements at the truth. Each error that lasts and acts is one more
+    state, in this order: the speed's scale, the yaw rate's bias, the compass's bias. First positions have no prior,
+    first headings are uniform over a turn. Outliers do not count.
 
     Args:
         fleet: truth.
@@ -249,10 +249,10 @@ def position_stages(
 ) -> list[Stage]:
     """Every step of the positions of vehicles (columns) that are members of it.
 
-    Where fixes have time-correlated errors, z = x + own + common + white noise, three more numbers of a member are its
-    own error, and one more member, in the column behind all, has the common error as its first three numbers. Errors
-    are Gauss-Markov, e_t = keep e_{t-1} + w. Where not all is `measured`, positions have a faint prior, so that a
-    member without any measurement has a covariance.
+    Where fixes have time-correlated errors, z = x + own + common + white noise, each member has its own error as three
+    more states, and one more member, in the last column, has the common error as its first three. Errors are
+    Gauss-Markov, e_t = keep e_{t-1} + w. Where not all is `measured`, positions have a weak prior, so that a member
+    without any measurement has a covariance.
     """
     drifts, white, stages = drifting(sensors), 1.0 / np.square(sensors.gnss_std), list[Stage]()
     own, common = (max(std**2, NO_ERROR) for std in (sensors.gnss_drift_std, sensors.gnss_common_std))

@@ -112,8 +112,8 @@ def of_training(
 def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     """The ledger of a drive: the messages that the egos of a track broadcast and received.
 
-    A message as long as the neighbourhood goes to a centre, which answers each: at every step at which the vehicle is
-    there, one on either way has its overhead.
+    A message whose length depends on the number of neighbours goes to a centre, which answers it: every step at which
+    the vehicle is present counts the overhead of one message in each direction.
 
     Args:
         track: with its bytes on air.

@@ -27,8 +27,8 @@ UPLOAD = Message("fix, velocity and relative measurements", 8, per_neighbour=4)
 DOWNLOAD = Message("estimate and covariance", 11)
 """From the centre: position (3), covariance (6), id and time (2)."""
 CENTRE = (
-    "needs a centre that every vehicle reaches, at once: loss acts on relative measurements only, delay and a byte cap "
-    "on nothing"
+    "needs a centre that every vehicle reaches without delay: lost messages cost relative measurements only, latency "
+    "and a byte cap have no effect"
 )
 NOT_CAUSAL = "not causal: every estimate depends on the whole drive"
 MIN_ANGLE_STDS = 0.1

@@ -159,10 +159,10 @@ class CooperativeFilter(Checked):
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
-        priors: of errors; the default was chosen on development worlds and validation tasks of CL-Bench, and is
-            ON_ROADS where measurements are not simulated: there errors of odometry are assumed until the whole fleet
-            speaks for none, and fixes to err twice as far as is stated, together for a while; STATED where the log says
-            how far its odometry errs.
+        priors: of errors. The default was chosen on development worlds and validation tasks of CL-Bench. Real
+            measurements have the default ON_ROADS: odometry errs until the evidence of the whole fleet is against it,
+            and the standard deviation of fixes is twice the stated one. A log that states the noise of its odometry has
+            the default STATED.
 
     References:
         Ljung, Soderstrom, Theory and Practice of Recursive Identification, MIT Press, 1983;
@@ -200,11 +200,11 @@ class CooperativeFilter(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
-        `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
-        "compass_error" rad, "scale_error", "range_offset" m and "range_scale"; whether it "slips", or is "alone";
-        "range_level" and so on, factors of standard deviations. And the weights, 1 for a number that was believed, of
-        each ego's "fix" (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where
-        there was none, whether it is "trusted", and by how many s its "clock" is ahead.
+        `extras` hold estimated errors, (R, T, E) each: the ego's "heading_error" and "compass_error" rad,
+        "scale_error", "range_offset" m and "range_scale"; whether it "slips", or is "alone"; "range_level" and so on,
+        factors of standard deviations. They also hold weights, 1 for a measurement that was fully used: of each ego's
+        "fix" (R, T, E), and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was
+        none. By link, too: whether the neighbour is "trusted", and by how many s its "clock" is ahead.
         """
         noise_model = resolve(self.noise_model, check_recording(recording))
         priors = priors_of(self, noise_model, recording.measured)
@@ -255,16 +255,16 @@ class CooperativeFilter(Checked):
 
 
 def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:
-    """Notes of what is otherwise than stated in the second half of a drive, mean squares over runs and steps.
+    """Notes on what differs from the stated noise in the second half of a drive, by mean squares over runs and steps.
 
-    A level that nothing has moved is no news; nor are, where fixes are assumed to err more than is stated, quiet
-    numbers of other kinds.
+    A level that no measurement has changed has no note. Where fixes are assumed to err more than stated, low levels of
+    ranges, angles and motions have none either.
 
     Args:
         ego: its name.
         found: (R, T, 13) errors that last, whether it slips, whether it is alone, and levels.
         fix: factor of the stated deviation of fixes that was assumed.
-        stated: deviations of the errors of the compass, rad, and of ranges, m: no more than these is worth no note.
+        stated: deviations of the errors of the compass, rad, and of ranges, m; errors within them have no note.
 
     >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the stated deviation']
@@ -301,7 +301,7 @@ def rejected(what: str, count: int, measured: int, share: float = 0.05) -> list[
 
 
 def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
-    """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: their errors last."""
+    """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: then their errors last."""
     lag = max(round(1.0 / dt), 1)
     product, square = residual[:, lag:] * residual[:, :-lag], np.nansum(residual**2)
     correlation = (

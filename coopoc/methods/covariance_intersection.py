@@ -28,8 +28,8 @@ class CovarianceIntersection(Checked):
     each other, which a GNSS error common to all would break. Because a used message may be used again, the newest one
     serves, brought forward with its velocity, until it is too old.
 
-    The weight $w$ makes the trace of the fused covariance least. CI gains little where a neighbour knows the ego worse
-    than the ego does: w is then 1.
+    The weight $w$ minimises the trace of the fused covariance. It is 1 where a neighbour knows the ego worse than the
+    ego does: CI gains little there.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.

@@ -39,11 +39,14 @@ def doubts(
     noise_model: NoiseModel | str = "nominal",
     neighbours: Floats | None = None,
 ) -> tuple[str, ...]:
-    """Notes of what contradicts the estimates of some vehicles in any run, and when: JUDGED_IN_A_ROW numbers in a row.
+    """Notes on what contradicts the estimates of vehicles in any run, and when.
 
-    Receivers that are rejected or filters that are lost: all fixes are beyond their gate. Covariances: the fixes' mean,
-    or their mean square, is farther off than chance allows. Odometers: the fixes move otherwise, again beyond chance.
-    Neighbours: all messages, or relative measurements, are beyond HARD_REJECT_FACTOR gates.
+    A note needs JUDGED_IN_A_ROW successive measurements:
+
+    - fixes all beyond their gate: the filter rejects its receiver, or is lost;
+    - fixes whose mean, or mean square, is farther off than chance allows: the covariance is wrong;
+    - fixes that move otherwise than the odometer, beyond chance;
+    - messages, or relative measurements, of a neighbour that are all beyond HARD_REJECT_FACTOR gates.
 
     Args:
         recording: of all vehicles, with the noise that methods know.

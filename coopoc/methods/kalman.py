@@ -123,12 +123,14 @@ def solo_track(
     return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
 
-def known_start(x0: Floats, shape: tuple[int, ...]) -> Floats:
-    """A known start x0 (R, E, 3) or (E, 3) m in the shape (R, E, 3); InputError for another one."""
-    if np.shape(x0) not in (shape, shape[1:]):
-        allowed = f"must be (R, E, 3) = {shape} or (E, 3)"
+def start_of(x0: Floats | None, fixes: Floats) -> Floats:
+    """A known start x0 (R, E, 3) or (E, 3) m, else the first fixes (R, E, 3) m; InputError for another shape."""
+    if x0 is None:
+        return fixes
+    if np.shape(x0) not in (fixes.shape, fixes.shape[1:]):
+        allowed = f"must be (R, E, 3) = {fixes.shape} or (E, 3)"
         raise InputError("x0", f"shape {np.shape(x0)}", allowed, "Give one position per ego.")
-    return np.broadcast_to(x0, shape)
+    return np.broadcast_to(x0, fixes.shape)
 
 
 def solo_filter(
@@ -171,5 +173,5 @@ def solo_filter(
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
     x, p = np.empty(size), np.empty(size)
     if x0 is not None:
-        x[:, 0] = known_start(x0, (len(gnss), *shape[2:]))
+        x[:, 0] = start_of(x0, gnss[:, 0, columns])
     return x, p, run_filter(inputs, fixes.gate, x0 is not None, index, x, p)

@@ -38,7 +38,7 @@ class NoiseModel:
         fleet: whose true velocity is known, for the oracle only.
         compass: (2,) rad, noise and constant error of the heading, both of which are within the azimuth's std.
         notes: of the Track, what was changed of the recording or of the noise.
-        extra: (R, T, N) m^2, what the variance of each motion has more where `methods.odometry_fault` corrects it.
+        extra: (R, T, N) m^2, increase of the variance of each motion where `methods.odometry_fault` corrects it.
     """
 
     name: str
@@ -96,9 +96,9 @@ class NoiseModel:
         measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them; so do
         fixes on an axis without any error, as the height of a drive in one plane is.
 
-        Errors of real measurements last, which no white noise says: of a log the last third is held out, and unless
-        a Kalman filter fitted to the rest is better there, by the 95 % interval over HELD_OUT blocks of time, `nominal`
-        is returned, with a note.
+        Errors of real measurements last, which white noise cannot describe. So the last third of a log is held out,
+        and `nominal` is returned with a note, unless a Kalman filter fitted to the rest is better there by the 95 %
+        interval over HELD_OUT blocks of time.
 
         Args:
             recording: of the training vehicles.
@@ -136,7 +136,8 @@ class NoiseModel:
         Args:
             recording: with the velocities.
             columns: (E,) of the vehicles; None for all.
-            inbox: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
+            inbox: of the one vehicle. The result is then (R, T, N, 3), of all vehicles as that one knows them from the
+                messages that arrive.
             first: step at which the filter begins.
         """
         velocity, links, dt = recording.velocity, recording.links, recording.dt
@@ -302,7 +303,7 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
 
 
 def _resolvable(noise_model: NoiseModel) -> NoiseModel:
-    """With relative noise that is not finer than FINEST and UNEVEN say, angles at a distance of 1 m; a note names the
+    """The model with relative noise of at least FINEST and UNEVEN, angles at a distance of 1 m; a note names the
     floor."""
     if noise_model.sensors is None:
         return noise_model

@@ -108,8 +108,8 @@ class StarStream:
     until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
     that is measured but whose messages never arrive, nothing is assumed.
 
-    For a recording the std of ranges that are finer than their angles bear is raised (`noise_model.resolve`); a stream
-    does not know the ranges to come, and takes what the noise model says.
+    In a recording the std of ranges is raised where their direction is uncertain (`noise_model.resolve`). A stream does
+    not know the ranges to come and takes the noise model as it is.
 
     Args:
         filter: its noise model is "identity" or holds constant noise. Neighbours send what `broadcast` of theirs holds.

@@ -21,7 +21,7 @@ UNSOUND = (
     "covariances are not symmetric and positive semidefinite: a method of one's own returns others, or the assumed "
     "standard deviations lie too far apart for double precision; raise the smallest"
 )
-"""What a note says of covariances that are no covariances."""
+"""Note on covariances that are none."""
 
 
 @dataclass(frozen=True, eq=False)

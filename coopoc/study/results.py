@@ -171,7 +171,7 @@ def _joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
 def ego_by_run(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
     """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing.
 
-    A run that no ego has a number of is no run.
+    A run without a value of any ego is left out.
     """
     frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame}, _value=frame[value].astype(float))
     cells = frame.groupby(["ego", "run"])["_value"]

@@ -148,11 +148,12 @@ from .otherwise import (
 def run_filter(
     measurements: Measurements, assumed: Assumptions, sent: Floats, odometry: Floats, model: Model
 ) -> tuple[Floats, Floats]:
-    """Of the ego (R, T, 1 + FOUND + 12) the weight of its fix, what is otherwise than assumed, its position m and
-    covariance m^2; by link (R, M, 9) the neighbour's position m, the weights of range, azimuth, inclination and
-    message, NaN for none, whether it is trusted, and by how many s its clock is ahead.
+    """Filter a whole drive.
 
-    NaN until a fix, or what a neighbour sends and the ego measures of it, shows where the ego is.
+    Returns two arrays. Of the ego, (R, T, 1 + FOUND + 12): the weight of its fix, estimated errors, position m and
+    covariance m^2. By link, (R, M, 9): the neighbour's position m; the weights of range, azimuth, inclination and
+    message, NaN for none; whether it is trusted; by how many s its clock is ahead. All are NaN until a fix, or a
+    neighbour's message and a measurement of it, shows where the ego is.
 
     Args:
         measurements: measurements and messages of the ego.
@@ -239,8 +240,9 @@ def step(
     vehicles: Ints,
     count: int,
 ) -> None:
-    """A step; where its numbers are unlikely, the likelier of two: of an ego that slips, or whose odometry fails as its
-    fixes show, and of one that does not; beside it one of the ego alone, once it has met a neighbour.
+    """One step. Where its innovations are unlikely, it is also tried for an ego that slips, or whose odometry fails as
+    its fixes show, and the likelier result is kept. Once the ego has met a neighbour, a filter of the ego alone runs
+    beside this one.
 
     Args:
         f: filter, after `begin`.
@@ -534,7 +536,7 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
 
 @part
 def add_way(f: Filter, rows: Floats, k: int) -> None:
-    """Rows of a member that has moved since it was at its position."""
+    """Rows of a member that has moved since its message."""
     g, h, w, n, age = f.g, f.h, f.h.matrix, f.h.block[TERMS], f.ego[CLOCK] - f.member[k, WHEN]
     often, changed = (age / f.ego[SPAN]) ** 2, (0.5 * ACCELERATION * age * age) ** 2
     first = 3 * g.block[k, TURN]

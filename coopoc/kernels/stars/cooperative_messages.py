@@ -234,8 +234,8 @@ def message_rows(
 
 @part
 def goes_on(f: Filter, rows: Floats, k: int) -> bool:
-    """How far member k has moved since it sent its newest message, by the velocity in that if it is plausible, and the
-    derivatives of the way; False if the message is of now."""
+    """Motion of member k since its newest message, by the velocity in it if plausible, and the derivatives of that
+    motion; False if the message is of this step."""
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
@@ -251,9 +251,9 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: b
 
 @inside
 def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> float:
-    """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
-    information that it keeps. What makes a receiver err lasts: the n-th fix in a row beyond the gate counts 1 / n, of a
-    neighbour where two others are trusted.
+    """Update by the rows of a vehicle's fix, unless its receiver errs more than assumed; the share of its information
+    that it keeps. Causes of receiver errors last, so the n-th fix in a row beyond the gate counts 1 / n; a neighbour's
+    does so where two others are trusted.
 
     Args:
         f: filter.
@@ -305,8 +305,8 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
 
 @part
 def as_answered(f: Filter, q: float) -> float:
-    """Squared normalised distance of the ego's fix from the answer, that of the state being `q`: what is averaged over
-    errors that may not be there is surer of them. Of fixes whose errors are states it is `q`."""
+    """Squared normalised distance of the ego's fix from the answer, where that from the state is `q`: the answer, which
+    is averaged over errors that may not be there, is more certain. For fixes whose errors are states it is `q`."""
     g, h, square = f.g, f.h, 0.0
     if has(g, 0, ERROR) or has(g, 0, COMMON):
         return q
@@ -319,16 +319,16 @@ def as_answered(f: Filter, q: float) -> float:
 
 @inside
 def wrong(f: Filter, model: Model, k: int, q: float) -> bool:
-    """Whether it is the receiver of member k that errs: on average, or for so long that fixes would be used again, the
-    ego's beside a neighbour that is trusted."""
+    """Whether the receiver of member k errs: on average, or for so long that its fixes would be used again. The ego's
+    counts as wrong in the second way only beside a trusted neighbour."""
     locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True) > 0)
     return wrong_on_average(f, model, k, q) or locked
 
 
 @inside
 def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
-    """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
-    assumed; or, where that error is being estimated, with the last one alone."""
+    """Whether the mean of a vehicle's clipped innovations is likelier with another error of its fixes than the assumed
+    one; where that error is being estimated, whether the last innovation alone is."""
     h, status = f.h, f.status[f.who[k, VEHICLE]]
     status[COUNT] = count = min(status[COUNT] + 1.0, WINDOW)
     if status[TRUSTED] == 0.0 and q > max(model.fix_gate, FIX_GATE):

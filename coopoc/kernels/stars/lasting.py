@@ -1,12 +1,13 @@
 """Errors of fixes that last and that no sensor states: no state, but part of what the ego's answer is uncertain by.
 
-An error is what the filter sees of it, a fix less the estimate after the step. Those of white noise are uncorrelated;
-the covariance c of one with those of the second before is the variance of what lasts, the estimate's own error among
-it. Where c is more than its standard error s, the answer's covariance, axes together, is c - s^2 / c at least; what is
-added is shared as the variance of a fix is. What the estimate follows, and what all receivers share, nothing shows.
+The filter observes an error as a fix less the estimate after the step. Errors of white noise are uncorrelated, so the
+covariance c of an error with those of the second before is the variance of lasting errors, the estimate's own among
+them. Where c exceeds its standard error s, the answer's covariance, summed over the axes, is at least c - s^2 / c; the
+increase is divided among the axes as the variance of a fix is. Errors that the estimate follows, or that all receivers
+share, cannot be observed.
 
-In a star the errors of others show how far a receiver errs that nothing is wrong with: as far as the half of them that
-are nearest to another differ from that. Liars that are fewer, alike or not, and a wrong position of the ego, which all
+In a star the errors of the others show how far a sound receiver errs: at least half of them have another one within
+that distance. A minority of spoofed receivers, alike or not, and a wrong position of the ego, which all
 these errors have in common, hardly change it.
 
 References:
