@@ -158,13 +158,12 @@ def test_folders_that_cannot_be_used_are_named(other_set, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(other_set, bare)
     (bare / "Landmark_Groundtruth.dat").unlink()
-    impossible = [("calibrate_s", 1000), ("calibrate_s", True), ("block_s", -1), ("drive_s", -1)]
-    impossible += [("landmarks", -1), ("max_neighbours", 10**9)]
+    wrong = {"calibrate_s": 1000, "block_s": True, "drive_s": -1, "landmarks": -1, "max_neighbours": 10**9}
     for data, more, words in (
         (bare, {}, "Landmark_Groundtruth"),
         (tmp_path, {}, "folder of TUM, MR.CLAM or log files"),
         (tmp_path / "nowhere", {}, "not only of drives"),
-        *((other_set, {name: value}, f"{name} = {value}") for name, value in impossible),
+        *((other_set, {name: value}, f"{name} = {value}") for name, value in wrong.items()),
         (other_set, {"max_neighbours": "0,4"}, "max_neighbours = 4: leads to no cell.* Write max_neighbours=0"),
     ):
         with refused(words):
