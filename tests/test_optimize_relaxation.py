@@ -162,6 +162,10 @@ def test_no_point_beats_the_bounds(make, seed):
             turned[0] = space.rotation(problem.x0)[0]
         point = space.join(rng.normal(0, 10, (len(problem.names), problem.dimension)), turned)
         assert problem.cost(point) >= best
+    if problem.poses and not problem.fixed:
+        form = quadratic(problem)
+        X = form.lift(space.position(point), space.rotation(point))
+        assert 0.5 * np.square(form.rows @ X).sum() == pytest.approx(problem.cost(point))
     assert relaxation.solution.status is Status.SOLVED or problem.poses
     assert best <= relaxation.solution.cost * (1 + 1e-9) + 1e-9
     assert relaxation.solution.cost <= relaxation.cost * (1 + 1e-9) + 1e-12

@@ -18,6 +18,7 @@ from coopoc.optimize.model.factor import taken
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
 from coopoc.optimize.starts.graph_starts import tree, walk
+from coopoc.optimize.starts.mirrors import ranges_of
 from coopoc.optimize.starts.windings import rewound
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -126,7 +127,9 @@ def test_exact_ranges_end_at_the_truth_without_a_word():
     truth = np.random.default_rng(0).uniform(0, 100, (8, 3))
     pairs = np.column_stack(np.triu_indices(8, 1))
     problem = Problem("abcdefgh").add("position", range(5), truth[:5], std=0.1)
-    found = solve(problem.add("range", pairs, np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)), std=0.1))
+    problem = problem.add("range", pairs, np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)), std=0.1)
+    found, ranges = solve(problem), ranges_of(problem, truth)
+    assert ranges.cost(ranges.distance[:, None], np.arange(len(pairs))) == 0.0
     assert np.abs(found.x - truth).max() < 1e-6
     assert not found.notes
 
