@@ -107,11 +107,10 @@ def race(
             y, ends = drawn(scattered(problem, x), x, landed, system.cost)
             name, x = (name if y is x else "drawn"), y
         far = name not in straight and system.cost(x) > limit
-        x, moves, others = across(problem, x, descend, system.cost, far)
+        x, moves, others = across(problem, x, landed, system.cost, far)
         name, cost = name + ", moved" * (moves > 0), system.cost(x)
         costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
-        others += [(each, x) for each in minima]
-        ends += [end for end in others if higher(end[0], cost, SAME_COST) or not higher(end[0], cost)]
+        ends += [*others, *((each, x) for each in minima)]
         notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
