@@ -156,8 +156,8 @@ def calibrated(p: Params) -> float:
         InputError: nothing is left to be scored.
     """
     length = source(p["data"]).seconds
-    usual, hint = min(LONGEST_CALIBRATION, CALIBRATION_SHARE * length), f"Leave a part of the {length:g} s to score."
-    return _set(p, "calibrate_s", usual, np.nextafter(length, 0.0), hint)
+    usual = min(LONGEST_CALIBRATION, CALIBRATION_SHARE * length)
+    return _set(p, "calibrate_s", usual, np.nextafter(length, 0.0), f"Leave a part of the {length:g} s to score.")
 
 
 def left(p: Params) -> float:

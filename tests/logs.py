@@ -92,8 +92,7 @@ def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: 
     """Ranges of one vehicle to another, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     gap = np.linalg.norm(at(fleet, other, t) - at(fleet, name, t), axis=1)
-    noisy = gap + np.random.default_rng(seed).normal(0, std, len(t))
-    return pd.DataFrame({"t": t, "vehicle": name, "partner": other, "range": noisy, "range_std": std})
+    return noisy(np.random.default_rng(seed), t, name, {"range": (gap, std)}).assign(partner=other)
 
 
 def noisy(rng: np.random.Generator, t: Any, name: str, columns: dict[str, tuple[Any, float]]) -> pd.DataFrame:

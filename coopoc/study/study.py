@@ -229,8 +229,8 @@ def _check_used(study: Study, name: str, usual: Sequence[Scalar]) -> None:
     used = _used(study, name) or _used(replace(study, grid={**study.grid, name: usual}), name)
     for value in study.grid[name]:
         if used and value not in used:
-            rest = ",".join(map(str, used))
-            raise InputError(name, repr(value), "leads to no cell under these settings", f"Write {name}={rest}.")
+            hint = f"Write {name}={','.join(map(str, used))}."
+            raise InputError(name, repr(value), "leads to no cell under these settings", hint)
 
 
 def _used(study: Study, name: str) -> list[Scalar]:
