@@ -25,8 +25,7 @@ from coopoc.world.storage import digest
 LONGEST_CALIBRATION, CALIBRATION_SHARE = 300.0, 0.4
 """s at most, and share of the drive, that calibrate and train where the settings leave it open."""
 BLOCK_SECONDS, MIN_BLOCKS = 30.0, 4
-"""s of a block of time, over which errors are averaged, and the least number of blocks, where the settings leave it
-open."""
+"""s of a block of time, over which errors are averaged, and the least number of blocks."""
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
@@ -166,8 +165,8 @@ def left(p: Params) -> float:
 
 
 def block(p: Params) -> float:
-    """s of a block of time, which errors are averaged over: set, else 30 s, a quarter of the rest at most."""
-    return _set(p, "block_s", min(BLOCK_SECONDS, left(p) / MIN_BLOCKS))
+    """s of a block of time, which errors are averaged over: 30 s, a quarter of the rest at most."""
+    return min(BLOCK_SECONDS, left(p) / MIN_BLOCKS)
 
 
 def driven(p: Params) -> float:

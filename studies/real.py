@@ -313,7 +313,6 @@ STUDY = Study(
     settings={
         "data": "mrclam-set6",
         "calibrate_s": None,
-        "block_s": None,
         "drive_s": None,
         "loss": 0.0,
         "evaluations": 150,

@@ -231,7 +231,7 @@ def test_innovations_of_poses_are_consistent_where_all_is_white():
 def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     """What the filter alone, called here, does with the same log is in the study's rows."""
     data = f"{written(tmp_path / 'log', noise=1.0)}?frame=body"
-    settings = {"data": data, "evaluations": 5, "calibrate_s": 10.0, "block_s": 5.0}
+    settings = {"data": data, "evaluations": 5, "calibrate_s": 10.0}
     results = co.run_study("real", tmp_path, settings=settings, progress=False)
     assert results.failed == 0
     frame = results.frame
@@ -241,7 +241,8 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     log = load_log(data)
     assert real.drives.calibrated(settings | {"calibrate_s": None}) == pytest.approx(0.4 * log.recording.t[-1])
     alone = co.PoseFilter("solo", lasting=True, gate=5.0)(log.recording, list(CARS))
-    apart = np.linalg.norm(alone.x[0, 100:150, 1] - np.pad(drives()["blue"][0][100:150], ((0, 0), (0, 1))), axis=1)
+    first = slice(100, 100 + int(real.drives.block(settings) / log.recording.dt))
+    apart = np.linalg.norm(alone.x[0, first, 1] - np.pad(drives()["blue"][0][first], ((0, 0), (0, 1))), axis=1)
     found = results.select(method="pose-fleet", max_neighbours=0, landmarks=1, ego="blue", run=0)["rt_le_m"]
     assert found.tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-9)
     error = results.select(method="pose-fleet").groupby("max_neighbours")["rt_le_m"].mean()

@@ -158,7 +158,7 @@ def test_folders_that_cannot_be_used_are_named(other_set, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(other_set, bare)
     (bare / "Landmark_Groundtruth.dat").unlink()
-    wrong = {"calibrate_s": 1000, "block_s": True, "drive_s": -1, "landmarks": -1, "max_neighbours": 10**9}
+    wrong = {"calibrate_s": 1000, "drive_s": -1, "landmarks": -1, "max_neighbours": 10**9}
     for data, more, words in (
         (bare, {}, "Landmark_Groundtruth"),
         (tmp_path, {}, "folder of TUM, MR.CLAM or log files"),
