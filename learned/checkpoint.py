@@ -2,7 +2,6 @@
 
 import json
 import platform
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -120,11 +119,9 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
         path: of the safetensors file.
         net: the net, "folder/mine.py:Net", if it is one of your own files; a card cannot name such a file.
 
-    A file without a checksum, which another program wrote, is read with a warning.
-
     Raises:
-        InputError: no such file, a wrong checksum, no card, a kind of net that is not installed, a file that `net` does
-            not name, or tensors of another shape than its net has.
+        InputError: no such file, a wrong checksum or none, no card, a kind of net that is not installed, a file that
+            `net` does not name, or tensors of another shape than its net has.
     """
     path, net = given_path(path), instance("net", net, str, 'Give "mine.py:Net".')
     tensors, card = read(path)
@@ -181,17 +178,11 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and card of a file, its checksum checked.
 
     Raises:
-        InputError: no such file, another format, a wrong checksum.
+        InputError: no such file, another format, a wrong checksum or none.
     """
     with _opened(path) as file:
         content = {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
-    right = holds(path.read_bytes())
-    if right is False or (right is None and CHECKSUM in content[1]):
-        hint = "Copy it again from where it came from, or delete it and train again."
-        raise InputError("checkpoint", path, "has another content than its checksum says: it is damaged", hint)
-    if right is None:
-        text = (
-            f"{path} has no checksum, so that no damage of its weights would be noticed; coopoc.learned.save adds one"
-        )
-        warnings.warn(text, RuntimeWarning, stacklevel=3)
+    if not holds(path.read_bytes()):
+        hint = "Copy it again from where it came from, or write it with coopoc.learned.save."
+        raise InputError("checkpoint", path, "has no checksum, or another content than it says: it is damaged", hint)
     return content
