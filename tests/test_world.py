@@ -36,7 +36,7 @@ S2 = Sensors.paper_scenario2()
     ("change", "field"),
     [
         ({"t": [0.0, 0.1, 0.1]}, "t[2]"),
-        ({"t": [0.0, 0.1, 0.3]}, "t"),
+        ({"t": [0.0, 0.1, 0.201]}, "t"),
         ({"ids": ("a", "a")}, "ids"),
         ({"position": np.zeros((3, 1, 3))}, "position"),
         ({"position": np.full((3, 2, 3), np.nan)}, "position/velocity"),
