@@ -1,6 +1,6 @@
 """Innovation and residual statistics of a log (`residuals`), and sentences on what is implausible."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from coopoc.methods.odometry_fault import with_odometry
 from .estimates import (
     BEHIND,
     BESIDE,
+    CONFIDENT_RATIO,
     LEAST_CORRELATION,
     LEAST_COUNT,
     LEAST_DRIFT,
@@ -59,8 +60,6 @@ OFFSET_ERRORS = 6.0
 """Standard errors of an offset beyond which it is significant."""
 LEAST_ARM, LONGEST_ARM = 0.2, 30.0
 """m, least arm of an antenna that is reported, and longest that is one."""
-CONFIDENT_RATIO = 3.0
-"""Ratio of a filter's errors to their stated standard deviations, in a part of the drive, from which it is reported."""
 UNUSED_SHARE = 0.05
 """Share of the logged rows that may be left out without a sentence."""
 AXIS_TURN = 20.0
@@ -113,8 +112,9 @@ def check(log: Log) -> Check:
     elif log.recording.body is None:  # what errs says nothing of others
         result = _without(result, errs)
     result = replace(result, measurements=measurements(result))
-    sentences = tuple(sentence for rule in CHECKS for sentence in rule(result))
-    return replace(result, warnings=sentences, unseen=tuple(_unseen(result)))
+    named = [sentence for rule in CHECKS for sentence in rule(result)]
+    errs, missed = ([*_missing(result, what, named)] for what in ("filter errs", "fixes are off"))
+    return replace(result, warnings=(*errs, *named, *missed), unseen=tuple(_unseen(result)))
 
 
 def _failing(c: Check) -> dict[str, str]:
@@ -165,7 +165,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         if truth is not None:
             row["fix_error_m"] = _rms(rec.gnss[0, :, column] - truth.position[:, column])
             row["error_m"] = _rms(c.x[:, column] - truth.position[:, column])
-            row["error_per_std"], row["worst_at_s"] = worst(c, column)
+        row["misses"], row["per_std"], row["worst_at_s"] = worst(c, column)
         rows.append(row)
     return rows
 
@@ -230,15 +230,15 @@ def _of_rows(c: Check) -> list[str]:
     return [*sentences, *filter(None, [CLOCKWISE.format(", ".join(mirrored)) * bool(mirrored), summary.unread])]
 
 
-def _of_errors(c: Check) -> list[str]:
-    """Vehicles whose filter errs by more than it states."""
-    return [
-        f"{row['vehicle']}: its filter errs by {row['error_per_std']:.1f} times what it states in the tenth of the "
-        f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what other lines name, or by "
-        "noise that is not as stated."
-        for row in sorted(c.vehicles, key=lambda row: -(row.get("error_per_std") or 0.0))
-        if _beyond(row, "error_per_std", CONFIDENT_RATIO)
-    ]
+def _missing(c: Check, what: str, named: Sequence[str]) -> Iterator[str]:
+    """What filters miss by more than they state: fixes only of vehicles of which other sentences say nothing."""
+    for row in sorted(c.vehicles, key=lambda row: -row["per_std"]):
+        known = what != "filter errs" and any(row["vehicle"] in sentence for sentence in named)
+        if row["misses"] == what and row["per_std"] > CONFIDENT_RATIO and not known:
+            yield (
+                f"{row['vehicle']}: its {what} by {row['per_std']:.1f} times what its filter states from "
+                f"{row['worst_at_s']:.3g} s on: by what other lines name, or by noise that is not as stated."
+            )
 
 
 def _of_vehicles(c: Check) -> list[str]:
@@ -400,7 +400,7 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        wrong = _beyond(row, "nis", OUTLYING) or _beyond(row, "error_per_std", OUTLYING)
+        wrong = _beyond(row, "nis", OUTLYING) or row.get("per_std", 0.0) > OUTLYING
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             way = "behind" if lag > 0 else "ahead of"
             sentences.append(
@@ -479,7 +479,6 @@ def _below(errors: Mapping[str, float], enough: float) -> str:
 
 
 CHECKS: tuple[Callable[[Check], list[str]], ...] = (
-    _of_errors,
     _of_rows,
     _of_clocks,
     of_ranges,

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy  # as in `residuals`
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
@@ -32,6 +33,11 @@ MIN_OWN_SHARE = 0.02
 OUTLYING, TENTHS, DRIVE_PARTS = 5.0, 10, 40
 """Multiples of the median residual beyond which one is left out; parts of a drive in which a filter is judged, and
 those whose estimates give the standard error."""
+CONFIDENT_RATIO = 3.0
+"""Ratio of errors to the standard deviations that a filter states, in a part of the drive, from which it is
+reported."""
+RARE = 1e-6
+"""Chance of squared innovations from which they are beyond it."""
 ERRORS_LAST = 1.5
 """Factor of the standard errors of clocks: errors of two filters may last for most of a short drive."""
 LONG_LAG = 2.0
@@ -415,15 +421,24 @@ def on_time(c: Check, alike: bool) -> Check:
     return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], ranges=ranges)
 
 
-def worst(c: Check, column: int) -> tuple[float | None, float]:
-    """Error of a vehicle's filter over the deviation that it states, in the worst tenth of the drive, and when that
-    begins, s."""
-    assert c.log.truth is not None
-    size, t = dimensions(c.world), c.world.t
-    square, stated = np.square(c.x - c.log.truth.position)[:, column, :size], c.variance[:, column, :size]
-    tenths, there = np.arange(len(t)) * TENTHS // len(t), np.isfinite(square)
-    sums = [pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)]
-    ratios = (sums[0] / sums[1])[sums[1] > 0.0]
-    if ratios.empty:
-        return None, 0.0
-    return float(ratios.max() ** 0.5), float(t[tenths == ratios.idxmax()][0] - t[0])
+def worst(c: Check, column: int) -> tuple[str, float, float]:
+    """What a vehicle's filter misses by over CONFIDENT_RATIO of the deviations that it states: positions of a truth in
+    a tenth of the drive, else fixes, in one or alone, where that is beyond chance; by how many; and from when on, s."""
+    size, t, truth = dimensions(c.world), c.world.t - c.world.t[0], c.log.truth
+    tenths = np.arange(len(t)) * TENTHS // len(t)
+    if truth is not None:
+        square, stated = np.square(c.x - truth.position)[:, column, :size], c.variance[:, column, :size]
+        there = np.isfinite(square)
+        sums = [pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)]
+        ratios = (sums[0] / sums[1])[sums[1] > 0.0] ** 0.5
+        if ratios.max() > CONFIDENT_RATIO:
+            return "filter errs", float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
+    squares = pd.Series(c.normalised[:, column]).dropna()
+    parts = [
+        (at[0], squares[at].mean(), len(at))
+        for groups in (tenths[squares.index], squares.index)
+        for at in squares.groupby(groups).groups.values()
+    ]
+    step, square, count = np.array([(0, 0.0, 1), *parts]).T
+    square[size * count * square < scipy.stats.chi2.isf(RARE, size * count)] = 0.0
+    return "fixes are off", float(square.max() ** 0.5), float(t[int(step[square.argmax()])])
