@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from logs import bends, drive, fixes, motion, outliers, ranges, write
+from logs import bends, drive, fixes, motion, noisy, outliers, ranges, write
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
@@ -327,3 +327,27 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
         result = check(read_log(log, std={"x": 1.0, "y": 1.0}))
         every = "\n".join([*result.warnings, *result.unseen])
         assert re.search(r"turned by 1\.|whether an error of 0\.0\d+ \+- 0\.0\d+ \(rad, of the direction", every)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("wheels", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
+        ("current", r"(offset=a\.vx:-0\.[23]\d*,a\.vy:\S+) takes it off"),
+        ("tunnel", r"a: its fixes are off by \d\S+ times what its filter states from [67]\d\d s on"),
+    ],
+)
+def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words):
+    """Fixes a minute apart, without a truth; a heading that is off from 600 s until the next fix, no more."""
+    rng, t = np.random.default_rng(3), np.arange(0.0, 900.0)
+    heading, v = 2.5 * np.sin(0.03 * t), 4 + np.sin(0.02 * t)
+    u = v * np.exp(1j * heading) + 0.3 * (fault == "current")
+    x = np.cumsum(u) - 0.5 * u
+    off = 0.2 * (fault == "tunnel") * (t > 600) * (t < 660)
+    measured = {"speed": (v * (1.02 if fault == "wheels" else 1.0), 0.05), "heading": (heading + off, 0.01)}
+    odometry, seen = noisy(rng, t, "a", measured), noisy(rng, t, "a", {"x": (x.real, 2.0), "y": (x.imag, 2.0)})
+    write(pd.concat([odometry, seen[::60]]), tmp_path / "log.csv")
+    found = re.search(words, said(read_log(tmp_path)))
+    assert found
+    for option in found.groups():
+        assert said(load_log(f"{tmp_path}?{option}")) == ""

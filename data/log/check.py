@@ -272,8 +272,8 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         sentences.append(
             f"{name}: it moves by {pace:.2f} +- {unsure:.2f} m/s towards "
             f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
-            f"current, a ferry; or fixes that drift. offset=vx:{-east:.2g},vy:{-north:.2g} takes it off velocities if "
-            "it is alike for all; else the std of a speed or velocity that lets filters follow the fixes is "
+            f"current, a ferry; or fixes that drift. offset={name}.vx:{-east:.2g},{name}.vy:{-north:.2g} takes it off; "
+            "if it changes, the std of a speed or velocity that lets filters follow the fixes is "
             f"{pace * (len(c.world.t) / row['fixes']) ** 0.5:.2g} m/s."
         )
     if turn is not None and abs(turn) > AXIS_TURN:
@@ -308,8 +308,8 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         word = "fast" if row["speed_excess"] > 0 else "slow"
         sentences.append(
             f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
-            f"{100 * row['speed_excess_error']:.2f} %: multiply its speeds by "
-            f"{1 / (1 + row['speed_excess']):.4g}, or take a pose filter, which estimates it."
+            f"{100 * row['speed_excess_error']:.2f} %: scale={name}.speed:{1 / (1 + row['speed_excess']):.4g} mends it "
+            "(or of .vx and .vy), and a pose filter estimates it."
         )
     if _beyond(row, "yaw_rate_bias", LEAST_DRIFT):
         sentences.append(

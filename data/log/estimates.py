@@ -22,8 +22,10 @@ BESIDE, BEHIND = 0.1, 0.1
 """m/s, least velocity across that of the odometry, and s, least lag of fixes behind it, that are reported."""
 UNITS_APART = 0.2
 """Relative error of lengths from which their unit is wrong."""
-LEAST_COUNT = 20
-"""Measurements from which a statistic is reported."""
+LEAST_COUNT, FEWEST = 20, 6
+"""Measurements from which a statistic is reported, and from which causes are told."""
+FEW_PARTS, SURELY = 10, 3e-5
+"""Parts of a drive below which a standard error is itself uncertain; chance of SURE_ERRORS to one side."""
 MOVED_STDS = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 LEAST_CORRELATION = 0.97
@@ -75,7 +77,7 @@ def factors(
     """
     k, all_of = x.shape[1], np.column_stack([y, x, x if z is None else z])
     none = Estimate(np.zeros(k), np.full(k, np.inf))
-    if len(y) < LEAST_COUNT:
+    if len(y) < FEWEST:
         return none
     if groups is not None:
         all_of = _centred(all_of, groups)
@@ -96,7 +98,7 @@ def factors(
     before, left = (np.median(np.abs(gap)) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    count = min(DRIVE_PARTS, len(y) // 2)
+    count = min(DRIVE_PARTS, max(len(y) // 2, min(len(y), FEW_PARTS)))
     changes = value - np.stack([fitted(every * count // len(y) != part) for part in range(count)])
     return Estimate(value, np.where(np.any(x, axis=0), lasting(changes), np.inf))
 
@@ -104,16 +106,18 @@ def factors(
 def lasting(parts: Floats) -> Floats:
     """Standard error (k,) of a sum of errors in parts (P, k) of a drive, each of which is correlated with the next, as
     of an autoregression of first order; the correlation of few is too small by chance (Kendall, Biometrika 41, 1954).
+    Of less than FEW_PARTS it is larger, as Student's t is, so that SURE_ERRORS of it are as sure.
 
     >>> wander = np.cumsum(np.random.default_rng(0).normal(size=(40, 1)), axis=0)
     >>> bool(lasting(wander)[0] > 2.0 * 40**0.5 * wander.std())
     True
     """
     errors, count = parts - parts.mean(axis=0), len(parts)
+    few = np.divide(*scipy.stats.t.isf(SURELY, [min(count, FEW_PARTS) - 1, FEW_PARTS - 1]))
     square = np.square(errors).sum(axis=0)
     next_to = (errors[1:] * errors[:-1]).sum(axis=0) / np.maximum(square, 1e-300)
     correlation = ((count * next_to + 1.0) / (count - 4.0)).clip(0.0, 0.95)
-    error: Floats = np.sqrt(square * (1.0 + correlation) / (1.0 - correlation))
+    error: Floats = few * np.sqrt(square * (1.0 + correlation) / (1.0 - correlation))
     return error
 
 
@@ -212,7 +216,7 @@ def odometry(c: Check, column: int) -> Estimate:
         moved, driven, turns, bends, span = moves(c, column)
         if len(moved) < LEAST_COUNT:
             means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2)
-            moved, driven, turns, bends, span = moves(c, column, max(means, 2))
+            moved, driven, turns, bends, span = moves(c, column, max(means, 1))
         square = max(np.square(np.abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
         y = moved - driven

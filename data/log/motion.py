@@ -46,6 +46,7 @@ HOLDS = "fixes that stay while the odometry moves on"
 CLOCKWISE = "yaw rates are anticlockwise, but fixes of {} turn the other way: scale=yaw_rate:-1 mends it"
 DERIVED = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
 
+VELOCITIES = ("vx", "vy", "vz")
 AHEAD: Floats = np.array([1.0, 0.0, 0.0])
 
 
@@ -74,6 +75,7 @@ class Steps(NamedTuple):
         planar: whether heights were not measured, and are 0.
         body: whether speed and yaw rate stay as they were measured.
         summary: counts what is read and what is not.
+        offset: as of `read_log`.
     """
 
     grid: Floats
@@ -81,6 +83,7 @@ class Steps(NamedTuple):
     planar: bool
     body: bool
     summary: Summary
+    offset: Mapping[str, float] = {}
 
     @property
     def dt(self) -> float:
@@ -286,7 +289,7 @@ def _in_world(
     """Velocity (T, 3), NaN where its direction is unknown, None where the fixes have to show it; the samples that it is
     of; and the heading, by `measured` ones or derived."""
     summary, speed = steps.summary, way.speed
-    world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), only(rows, "speed")
+    world, speeds = samples(rows, VELOCITIES, summary, 2), only(rows, "speed")
     heading = _heading(measured, world, shown, derived, way, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
@@ -307,7 +310,8 @@ def _in_world(
         kept, own = np.isfinite(velocity[:, 0]), np.isin(at, speed.t)
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
         means = step_means(Signal(at[kept], velocity[kept]), steps.grid) + 0.0 * moving(steps.grid + 0.5 * steps.dt)
-        return means, Signal(at[own & kept], at), heading
+        beside = [steps.offset.get(f"{name}.{axis}", steps.offset.get(axis, 0.0)) for axis in VELOCITIES]
+        return means - beside, Signal(at[own & kept], at), heading
     if len(speed.t):
         raise InputError(
             f"{place(speeds)}, speed",

@@ -39,7 +39,7 @@ from ..nmea import DAY_S, read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
-from .motion import Member, Steps, member, samples, stacked
+from .motion import VELOCITIES, Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
 from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, not_vague, only, without_codes
 
@@ -148,9 +148,11 @@ def read_log(
         columns: names in the files, as {"t": "timestamp", "vehicle": "car"}.
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
-        scale: kind, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and ms.
-        offset: kind, or pair, in its unit here -> what all its measurements, or the pair's ranges, are too large by, as
-            {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; the check finds those of pairs.
+        scale: kind, of all or one vehicle, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and
+            ms, {"car1.speed": 0.98} of its wheels.
+        offset: kind, of all or one vehicle, or pair, in its unit here -> what these measurements, or the pair's ranges,
+            are too large by, as {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; vx, vy also
+            of velocities that are speeds along a heading, as in a current of -vx, -vy.
         std: kind -> standard deviation of all its measurements in its unit (m for degrees of latitude), as
             {"range": 0.15, "latitude": 1.5, "speed_kmh": 0.4}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
@@ -196,12 +198,15 @@ def read_log(
         "stamps": stamps,
     }
     rows = _rows(path, truth, summary, options)
-    factor = factors(scale, ("t", *KINDS))
-    by_kind, key, ends = rows["kind"].map(factor).fillna(1.0), rows["kind"], (rows["vehicle"], rows["partner"])
+    own, ends = rows["vehicle"] + "." + rows["kind"], (rows["vehicle"], rows["partner"])
+    names = *KINDS, *own.unique(), *(f"{name}.{kind}" for name in ends[0].unique() for kind in VELOCITIES)
+    factor = factors(scale, ("t", *names))
+    by_kind = rows["kind"].mask(own.isin(factor), own).map(factor).fillna(1.0)
+    key = rows["kind"].mask(own.isin(offset), own)
     for one, other in (ends, ends[::-1]):
         pair = one + "-" + other
         key = key.mask((rows["kind"] == "range") & pair.isin(offset), pair)
-    less = key.map(factors(offset, dict.fromkeys((*KINDS, *key)), "offset")).fillna(0.0)
+    less = key.map(factors(offset, dict.fromkeys((*names, *key)), "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = without_codes(unwrapped(rows, summary), summary)
@@ -229,7 +234,7 @@ def read_log(
     summary.refuse("heights of vehicles with few", rows[few])
     rows = rows[~few]
     grid = _grid(rows, dt, body, summary)
-    steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary)
+    steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary, offset)
     arms = antenna if isinstance(antenna, Mapping) else dict.fromkeys(ids, antenna)
     columns_of("antenna", [*named("antenna", arms, "Give antenna={name: (forward, left, up)}.")], ids)
     members = {name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name)) for name in ids}

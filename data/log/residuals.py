@@ -140,11 +140,16 @@ def without_wild(c: Check) -> Check:
     size, rec = dimensions(c.world), c.log.recording
     square = pd.DataFrame(size * c.normalised)
     square[[*map(rec.ids.index, c.failing)]] = np.nan
-    wild = square > WILD_STDS**2 * (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS)
-    if rec.body is not None or not wild.to_numpy().any():
+    usual = (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS)
+    wild = np.array(square > WILD_STDS**2 * usual)
+    for column in range(wild.shape[1]):  # where the next fix is off alike, the filter is
+        at = np.flatnonzero(np.isfinite(c.fix[:, column, 0]))
+        gap, off = plane(c.fix[at, column]), wild[at, column]
+        wild[at[:-1], column] &= ~(off[1:] & ((gap[:-1] * gap[1:].conj()).real > 0))
+    if rec.body is not None or not wild.any():
         return c
-    less = replace(rec, gnss=np.where(wild.to_numpy()[..., None], np.nan, rec.gnss))
-    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum().to_numpy(), failing=c.failing)
+    less = replace(rec, gnss=np.where(wild[..., None], np.nan, rec.gnss))
+    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(axis=0), failing=c.failing)
 
 
 def filtered(log: Log) -> Check:
