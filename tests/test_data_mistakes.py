@@ -210,6 +210,15 @@ def test_separators_and_decimal_commas_change_nothing(tmp_path, text, mark, poin
     assert same(co.read_log(tmp_path / "a.csv").recording, co.read_log(tmp_path / "b.csv").recording)
 
 
+@pytest.mark.parametrize("option", ["", "?columns=t:stamp.sec"])
+def test_seconds_and_nanoseconds_of_a_stamp_are_one_time(tmp_path, option):
+    (tmp_path / "plain.csv").write_text(WIDE)
+    plain = pd.read_csv(tmp_path / "plain.csv")
+    stamp = {"stamp.sec": plain["t"] // 1, "stamp.nanosec": (plain["t"] % 1 * 1e9).round()}
+    plain.assign(**stamp).drop(columns="t").to_csv(tmp_path / "log.csv", index=False)
+    assert same(load_log(f"{tmp_path / 'log.csv'}{option}").recording, co.read_log(tmp_path / "plain.csv").recording)
+
+
 def parts(folder: Path) -> Path:
     """The good log in two tables whose headers differ, and its truth."""
     folder.mkdir()

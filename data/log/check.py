@@ -113,8 +113,8 @@ def check(log: Log) -> Check:
         result = _without(result, errs)
     result = replace(result, measurements=measurements(result))
     named = [sentence for rule in CHECKS for sentence in rule(result)]
-    errs, missed = ([*_missing(result, what, named)] for what in ("filter errs", "fixes are off"))
-    return replace(result, warnings=(*errs, *named, *missed), unseen=tuple(_unseen(result)))
+    first_of_all, at_last = ([*_missing(result, what, named)] for what in ("filter errs", "fixes are off"))
+    return replace(result, warnings=(*first_of_all, *named, *at_last), unseen=tuple(_unseen(result)))
 
 
 def _failing(c: Check) -> dict[str, str]:

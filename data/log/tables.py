@@ -1,5 +1,6 @@
 """Tables of a log: one row per measurement (long), or one column per kind (wide)."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,7 @@ def read_log_table(
     """
     file = path.name
     frame = read_frame(path, *(columns.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
+    frame = _with_whole_stamps(frame)
     frame = named_columns(frame, columns, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame:
         placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
@@ -82,6 +84,17 @@ def read_log_table(
     if "partner" not in frame and (in_group(rows, "relative") & rows["partner"].eq("")).any():
         raise missing_column(file, "partner", frame, "is needed")
     return rows
+
+
+def _with_whole_stamps(frame: pd.DataFrame) -> pd.DataFrame:
+    """The frame with stamps of whole seconds and nanoseconds beside them, as of ROS, in one column: t, if none is."""
+    for name in frame.select_dtypes("number"):
+        found = re.fullmatch(r"(.*?)n(?:ano)?(secs?)", str(name))
+        if found and (whole := found[1] + found[2]) in frame.select_dtypes("number"):
+            stamps = {whole: frame[whole] + 1e-9 * frame[name]}
+            frame = frame.assign(**stamps).drop(columns=name)
+            return frame if "t" in frame else frame.rename(columns={whole: "t"})
+    return frame
 
 
 def _long(
