@@ -1,6 +1,6 @@
 """Innovation and residual statistics of a log (`residuals`), and sentences on what is implausible."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -113,8 +113,7 @@ def check(log: Log) -> Check:
         result = _without(result, errs)
     result = replace(result, measurements=measurements(result))
     named = [sentence for rule in CHECKS for sentence in rule(result)]
-    first_of_all, at_last = ([*_missing(result, what, named)] for what in ("filter errs", "fixes are off"))
-    return replace(result, warnings=(*first_of_all, *named, *at_last), unseen=tuple(_unseen(result)))
+    return replace(result, warnings=(*_of_filters(result, named), *named), unseen=tuple(_unseen(result)))
 
 
 def _failing(c: Check) -> dict[str, str]:
@@ -230,15 +229,15 @@ def _of_rows(c: Check) -> list[str]:
     return [*sentences, *filter(None, [CLOCKWISE.format(", ".join(mirrored)) * bool(mirrored), summary.unread])]
 
 
-def _missing(c: Check, what: str, named: Sequence[str]) -> Iterator[str]:
-    """What filters miss by more than they state: fixes only of vehicles of which other sentences say nothing."""
-    for row in sorted(c.vehicles, key=lambda row: -row["per_std"]):
-        known = what != "filter errs" and any(row["vehicle"] in sentence for sentence in named)
-        if row["misses"] == what and row["per_std"] > CONFIDENT_RATIO and not known:
-            yield (
-                f"{row['vehicle']}: its {what} by {row['per_std']:.1f} times what its filter states from "
-                f"{row['worst_at_s']:.3g} s on: by what other lines name, or by noise that is not as stated."
-            )
+def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
+    """Vehicles whose filter errs by more than it states, or misses fixes so, and no sentence says why."""
+    return [
+        f"{row['vehicle']}: its {row['misses']} by {row['per_std']:.1f} times what its filter states from "
+        f"{row['worst_at_s']:.3g} s on: by what other lines name, or by noise that is not as stated."
+        for row in sorted(c.vehicles, key=lambda row: -row["per_std"])
+        if row["per_std"] > CONFIDENT_RATIO
+        and (row["misses"] == "filter errs" or not any(row["vehicle"] in sentence for sentence in named))
+    ]
 
 
 def _of_vehicles(c: Check) -> list[str]:
@@ -393,7 +392,8 @@ def _of_fixes(c: Check) -> list[str]:
             x, z = (each[:, finite, column].T * share for each in (made, then))
             factor, std = factors(off[finite, column], x, usual, every_one, z=z)
             sure = np.abs(factor) > OFFSET_ERRORS * std
-            if (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM:
+            arm = (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM
+            if arm:
                 sentences.append(
                     f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
                     f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {what}: "
@@ -405,12 +405,13 @@ def _of_fixes(c: Check) -> list[str]:
             way = "behind" if lag > 0 else "ahead of"
             sentences.append(
                 f"{name}: its fixes are {abs(lag):.0f} s {way} the {what}, which "
-                "they else follow: clocks differ, as by leap seconds, or files of two drives."
+                f"they else follow: clocks differ, as by leap seconds (clock={name}:{lag:.0f} where all its stamps "
+                "are so), or files of two drives."
             )
             continue
         if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND):
             continue
-        if truth is None:  # what draws aside draws along a bend, too
+        if truth is None or arm:  # what draws aside draws along a bend, too
             continue
         if sure[2] and abs(lag := factor[2]) >= LEAST_LAG:
             way = "ahead of" if lag > 0 else "behind"

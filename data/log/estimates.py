@@ -438,11 +438,8 @@ def worst(c: Check, column: int) -> tuple[str, float, float]:
         if ratios.max() > CONFIDENT_RATIO:
             return "filter errs", float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
     squares = pd.Series(c.normalised[:, column]).dropna()
-    parts = [
-        (at[0], squares[at].mean(), len(at))
-        for groups in (tenths[squares.index], squares.index)
-        for at in squares.groupby(groups).groups.values()
-    ]
-    step, square, count = np.array([(0, 0.0, 1), *parts]).T
-    square[size * count * square < scipy.stats.chi2.isf(RARE, size * count)] = 0.0
-    return "fixes are off", float(square.max() ** 0.5), float(t[int(step[square.argmax()])])
+    parts = squares.groupby(tenths[squares.index])
+    square = pd.concat([pd.Series([0.0]), squares, parts.transform("mean")])
+    count = np.concatenate([[1], np.ones(len(squares)), parts.transform("size")])
+    beyond = square.where(size * count * square > scipy.stats.chi2.isf(RARE, size * count), 0.0)
+    return "fixes are off", float(beyond.max() ** 0.5), float(t[beyond.idxmax()])

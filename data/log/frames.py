@@ -63,7 +63,8 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
     if 0 < back.mean() < DISORDER_SHARE:
         who = ", ".join(rows["vehicle"][back].unique())
         summary.assume(
-            f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set; rows are in their order"
+            f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set, or a logger that began "
+            "anew, whose parts are logs of their own; rows are in their order"
         )
     return rows
 
