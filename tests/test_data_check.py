@@ -338,7 +338,7 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     ],
 )
 def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words):
-    """Fixes a minute apart, without a truth; a heading that is off from 600 s until the next fix, no more."""
+    """Fixes a minute apart, and no truth; between two of them the heading is off."""
     rng, t = np.random.default_rng(3), np.arange(0.0, 900.0)
     heading, v = 2.5 * np.sin(0.03 * t), 4 + np.sin(0.02 * t)
     u = v * np.exp(1j * heading) + 0.3 * (fault == "current")
