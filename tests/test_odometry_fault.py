@@ -76,44 +76,27 @@ def test_a_neighbour_whose_wheels_spin_costs_the_joint_filter_little():
 
 
 @pytest.mark.parametrize("beside", [0, 1])
-@pytest.mark.parametrize("fault", ["a current", "slips"])
-def test_odometry_that_errs_a_little_costs_no_more_than_in_the_kalman_filter(fault, beside):
-    """Ships in a current of a ninth of their speed, mowers that slip for 10 s a minute: fixes were taken for noisier
-    or wrong, and the cooperative filter ended 190 and 30 m off."""
-    t, ships = np.arange(900.0), fault == "a current"
+@pytest.mark.parametrize(("fault", "every"), [("current", 1), ("current", 5), ("current", 30), ("slips", 1)])
+def test_odometry_that_errs_a_little(fault, every, beside):
+    """The second half of half an hour. Ships in a current of a ninth of their speed: Kalman and joint filter were 46,
+    97 and 205 m off, the cooperative 19, 39 and 147. Mowers that slip for 10 s a minute: it was 30 m off."""
+    t, ships = np.arange(1800.0), fault == "current"
     course = 0.9 * np.sin(0.008 * t) if ships else np.pi * np.cumsum((t % 29 > 25) / 3.0)
     u = np.where(ships, 7.0, 0.8) * np.stack([np.cos(course), np.sin(course), 0.0 * t], axis=-1)[:, None]
     wrong = np.array([-0.6, -0.5, 0.0]) if ships else u * (t % 60 < 10)[:, None, None]
-    velocity = np.broadcast_to(u - wrong * ships, (900, 2, 3))
+    velocity = np.broadcast_to(u - wrong * ships, (1800, 2, 3))
     fleet = co.Fleet(("a", "b"), t, velocity.cumsum(axis=0) + np.array([[0.0] * 3, [0.0, 40.0, 0.0]]), velocity)
-    std, floor, ranges = (2.0, 0.12, 5.0) if ships else (0.5, 0.05, 0.1)
+    std, floor, ranges = (3.0, 0.05, 5.0) if ships else (0.5, 0.05, 0.1)
     sensors = co.Sensors(gnss_std=(std,) * 3, velocity_std_ratio=0.0, velocity_floor=floor, range_std=ranges)
     seen = observe(fleet, sensors, V2X(beside, radius=100.0), runs=4)
-    gnss = np.where(np.arange(900)[:, None, None] % (2 if ships else 1), np.nan, seen.gnss)
+    gnss = np.where(t[:, None, None] % every, np.nan, seen.gnss)
     relative = np.where([True, False, False], seen.relative, np.nan)
     log = replace(seen, gnss=gnss, velocity=seen.velocity + wrong, relative=relative, notes=(NOTHING_SIMULATED,))
-    mine, kalman = (
-        np.sqrt(np.nanmean(np.square(m(log, (0, 1)).x - fleet.position)[..., :2].sum(axis=-1), axis=(0, 1)))
-        for m in (CooperativeFilter(), Kalman())
+    kalman, joint, mine = (
+        np.sqrt(np.square(m(log, (0, 1)).x - fleet.position)[:, 900:, :, :2].sum(axis=-1).mean())
+        for m in (Kalman(), JointFilter(), CooperativeFilter())
     )
-    assert (mine < (0.8 if ships else 1.1) * kalman).all(), (mine, kalman)
-
-
-@pytest.mark.parametrize("every", [1, 5, 30])
-def test_a_current_is_found_by_every_filter_however_rare_fixes_are(every):
-    """The last half of half an hour: Kalman and joint filter were 46, 97 and 205 m off, the cooperative 19, 39, 147."""
-    t = np.arange(1800.0)
-    course = 0.9 * np.sin(0.008 * t)
-    u = 7.0 * np.stack([np.cos(course), np.sin(course), 0.0 * t], axis=-1)[:, None]
-    current = np.array([0.6, 0.5, 0.0])
-    fleet = co.Fleet(("ship",), t, (u + current).cumsum(axis=0), u + current)
-    sensors = co.Sensors(gnss_std=(3.0,) * 3, velocity_std_ratio=0.0, velocity_floor=0.05)
-    seen = observe(fleet, sensors, V2X(0), runs=4)
-    log = replace(seen, gnss=np.where(np.arange(1800)[:, None, None] % every, np.nan, seen.gnss))
-    log = replace(log, velocity=seen.velocity - current)
-    for method in (Kalman(), JointFilter(), CooperativeFilter()):
-        gap = (method(log, [0]).x - fleet.position)[:, 900:, 0, :2]
-        assert np.sqrt(np.square(gap).sum(axis=-1).mean()) < 2.0 * 3.0, method
+    assert (max(kalman, joint, mine) < 2.0 * std) if ships else (mine < 1.1 * kalman)
 
 
 @pytest.mark.parametrize("act", [1.0, 3.0])
