@@ -24,10 +24,9 @@ import gtsam
 import numpy as np
 from hard_graphs import VARIANTS
 from tabulate import tabulate
-from unseen_graphs import FAMILIES
+from unseen_graphs import FAMILIES, alignment_error
 
 from coopoc.errors import InputError
-from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve

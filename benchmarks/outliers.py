@@ -13,9 +13,8 @@ import time
 import gtsam
 import numpy as np
 from tabulate import tabulate
-from unseen_graphs import joined, lost, manhattan, world, wrong
+from unseen_graphs import alignment_error, joined, lost, manhattan, world, wrong
 
-from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats.graph import Graph
 from coopoc.optimize import solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures

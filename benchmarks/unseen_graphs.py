@@ -20,6 +20,14 @@ from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import exp
 
 
+def alignment_error(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """ATE: root mean square m of positions (T, d) after the motion of SE(d) that brings them nearest (Kabsch's)."""
+    x, y = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    u, _, vh = np.linalg.svd(x.T @ y)
+    u[:, -1] *= np.sign(np.linalg.det(u @ vh))  # a turn, and no reflection
+    return float(np.sqrt(np.square(x @ u @ vh - y).sum(axis=-1).mean()))
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """True poses of robots, one after the other, then points; `steps` poses each."""

@@ -12,7 +12,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from coopoc.evaluate.metrics import aligned, alignment_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve
@@ -23,9 +22,9 @@ def main(path: str, picture: str | None = None) -> Solution:
     """Solve the file, say how good it is, and draw it if a file name is given."""
     graph = load_graph(path)
     problem = from_graph(graph)
-    before = alignment_error(problem.x0[graph.is_pose, :2], graph.position[graph.is_pose])
+    before = ate(graph, problem.x0[:, :2])
     solution = solve(problem)
-    after = alignment_error(solution.position[graph.is_pose], graph.position[graph.is_pose])
+    after = ate(graph, solution.position)
     print(problem)
     print(f"cost {problem.cost(problem.x0):.1f} -> {solution.cost:.2f} in {solution.solve_seconds:.1f} s")
     print(f"ATE {before:.3f} m (odometry) -> {after:.3f} m")
@@ -34,13 +33,27 @@ def main(path: str, picture: str | None = None) -> Solution:
     return solution
 
 
+def aligned(graph: Graph, position: np.ndarray) -> np.ndarray:
+    """Positions (n, 2) m after the motion of SE(2) that brings the poses nearest to the truth."""
+    center, true_center = position[graph.is_pose].mean(axis=0), graph.position[graph.is_pose].mean(axis=0)
+    z, true_z = ((x - x0) @ [1, 1j] for x, x0 in ((position, center), (graph.position, true_center)))
+    turn = np.vdot(z[graph.is_pose], true_z[graph.is_pose])
+    z = z * turn / abs(turn)
+    return np.stack([z.real, z.imag], axis=1) + true_center
+
+
+def ate(graph: Graph, position: np.ndarray) -> float:
+    """Root mean square m of the poses' errors after the alignment."""
+    error = (aligned(graph, position) - graph.position)[graph.is_pose]
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
 def draw(graph: Graph, solution: Solution, picture: Path) -> None:
     """Estimates over truth, one colour per robot."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    where = np.full_like(graph.position, np.nan)
-    where[graph.is_pose] = aligned(solution.position[graph.is_pose], graph.position[graph.is_pose])
+    where = aligned(graph, solution.position)
     figure, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
     for colour, (robot, places) in zip(plt.cm.tab10.colors, graph.robots.items(), strict=False):
         axes.plot(*graph.position[places].T, color="0.75", lw=2.5, zorder=1)

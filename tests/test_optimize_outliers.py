@@ -9,11 +9,10 @@ import pytest
 from conftest import refused
 from graph_files import write_graph
 from hard_graphs import kept
-from unseen_graphs import World, blocks, joined, lost, world, wrong
+from unseen_graphs import World, alignment_error, blocks, joined, lost, world, wrong
 
 import coopoc as co
 from coopoc.arrays import Bools, Ints
-from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures

@@ -8,8 +8,8 @@ from conftest import measured, refused
 from random_graphs import moved
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from unseen_graphs import alignment_error
 
-from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve

@@ -5,10 +5,10 @@ import pytest
 from conftest import refused
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from unseen_graphs import alignment_error
 
 from coopoc import V2X, JointFilter, Kalman, Sensors, load_fleet, observe, rt_le
 from coopoc.evaluate import statistics
-from coopoc.evaluate.metrics import alignment_error
 from coopoc.evaluate.statistics import mean_interval, over_seeds, paired_difference
 
 

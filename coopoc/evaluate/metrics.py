@@ -294,21 +294,3 @@ def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
         if normalised_square is not None:
             columns["nis"] = np.nansum(normalised_square, axis=1) / count
     return columns
-
-
-def aligned(estimate: Floats, truth: Floats) -> Floats:
-    """Positions (T, d) m after the motion of SE(d), d = 2 or 3, that brings them nearest to the truth (Kabsch's).
-
-    >>> x = np.array([[0.0, 0], [1, 0], [2, 1]])
-    >>> (aligned(x[:, ::-1] * [-1, 1] + 5.0, x).round(9) + 0.0).tolist()
-    [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]
-    """
-    x, y = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
-    u, _, vh = np.linalg.svd(x.T @ y)
-    u[:, -1] *= np.sign(np.linalg.det(u @ vh))  # a turn, and no reflection
-    return np.asarray(x @ u @ vh + truth.mean(axis=0))
-
-
-def alignment_error(estimate: Floats, truth: Floats) -> float:
-    """Root mean square m of what is left after `aligned` (ATE; evo's APE of the translation)."""
-    return float(np.sqrt(np.square(aligned(estimate, truth) - truth).sum(axis=-1).mean()))
