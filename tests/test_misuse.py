@@ -254,7 +254,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "PoseFilter": (
         partial(follow, co.PoseFilter),
-        {"recording": BODY, "egos": [0], "begin": np.full((4, 4), 0.7), "gate": 5.0},
+        {"recording": BODY, "egos": [0], "begin": np.full((4, 4), 0.7), "spread": np.full(4, 0.7), "gate": 5.0},
     ),
     "pose_start": (co.pose_start, {"recording": BODY, "seconds": 3.0, "gate": 5.0}),
     "OwnMeasurement": (own, {**MEASURED, "yaw_rate": 0.7, "heading": 0.7, "gate": 5.0}),

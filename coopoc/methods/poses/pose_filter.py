@@ -102,10 +102,13 @@ class PoseFilter:
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
-        spread = checked("spread", self.spread or SPREAD, "(4,)", (4,))
-        refuse("spread", spread, ~(spread > 0), "must be > 0", "Give m, m, m and rad.")
+        refuse("spread", self._spread, ~(self._spread > 0), "must be > 0", "Give m, m, m and rad.")
         if not self.name:
             self.__dict__["name"] = f"pose-{self.unit if self.fusion == 'joint' else self.fusion}"
+
+    @property
+    def _spread(self) -> Floats:
+        return checked("spread", SPREAD if self.spread is None else self.spread, "(4,)", (4,)).copy()
 
     @property
     def cooperative(self) -> bool:
@@ -217,7 +220,7 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         radians("headings of begin", first[3:])
-        return PoseStream(*self.settings(self.assumed, dt), first, np.array(self.spread or SPREAD, dtype=float), dt)
+        return PoseStream(*self.settings(self.assumed, dt), first, self._spread, dt)
 
     def run_filter(
         self,
@@ -241,7 +244,7 @@ class PoseFilter:
         from ...kernels.poses.ekf import run_filter
         from ...kernels.poses.scalar_update import new_poses
 
-        sensors, spread = self.assumed or recording.sensors, np.array(self.spread or SPREAD, dtype=float)
+        sensors, spread = self.assumed or recording.sensors, self._spread
         if self.spread is None and np.isfinite(recording.gnss[:, :, members]).any():
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
         noise, options = self.settings(sensors, recording.dt)
