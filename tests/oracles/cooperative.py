@@ -47,7 +47,6 @@ from coopoc.kernels.stars.otherwise import (
     MAX_LEVEL_CHANGE,
     MIN_LEVEL,
     PRIOR,
-    SHARED,
     SIDEWAYS,
     SLIP_DURATION_S,
     SLIP_HIDDEN_S,
@@ -600,8 +599,7 @@ class Oracle:
         total, s = np.trace(cov) + r.sum(), self.state
         change, square = np.square(gap - s.gap).sum() / 2 / total, gap @ gap / total
         wild, established = square > SUDDEN, s.agreed >= ESTABLISHED and s.locked.get(self.ego, 0.0) >= MAX_LOCKOUT
-        shared = 1.0 if wild and not established else SHARED if self.life.absent[0] == -inf else 0.0
-        noise = square - shared * (square - change) if kind == 3 else square
+        noise = change if kind == 3 and wild and not established else square
         self.learn(kind, min(noise, SUDDEN) - 1, r.sum() / total, 3)
         if kind == 3 and not (wild and (s.jumped or change > SUDDEN)):
             self.learn(5, min(square, SUDDEN) - 1, s.made / total, 3)

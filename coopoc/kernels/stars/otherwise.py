@@ -435,9 +435,6 @@ SUDDEN, USUAL_SQUARE = 5.0, 0.95
 """Largest squared normalised innovation that counts, and the mean of so clipped ones where the noise is as assumed."""
 MIN_LEVEL, MAX_LEVEL, MAX_LEVEL_CHANGE = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
-SHARED = 0.5
-"""Share of the common part of successive fix innovations that is ascribed to motion where odometry surely errs: a
-drifting receiver looks the same."""
 PRIOR = 10.0
 """Information of the prior of a level at its assumed value: that of twenty innovations."""
 UNTRUSTED, AGREEING = 30.0, 10.0
@@ -511,9 +508,7 @@ def learn_fix(f: Filter, model: Model, kind: int) -> None:
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     more, wild = min(innovation2 / s, SUDDEN) - 1.0, innovation2 > SUDDEN * s
     displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < MAX_LOCKOUT)
-    noise, shared = innovation2, SHARED if model.absent[0] == -math.inf else 0.0
-    if kind == FIXES:
-        noise -= (1.0 if displaced else shared) * (innovation2 - 0.5 * change2)
+    noise = 0.5 * change2 if kind == FIXES and displaced else innovation2
     learn(f, kind, min(noise / s, SUDDEN) - 1.0, r / s, 3.0)
     jumped = wild and (f.ego[JUMPED] > 0.0 or change2 > 2.0 * SUDDEN * s)
     if kind == FIXES and not jumped:
