@@ -72,7 +72,6 @@ class QCQPRelaxation:
                     problem = range_star(star, run, members, known)
                     if len(members) > 1:
                         relaxed = shor(problem)
-                        assert relaxed.solution is not None
                         solution = relaxed.solution
                         tight.append(relaxed.tight)
                     else:

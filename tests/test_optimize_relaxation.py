@@ -130,7 +130,7 @@ def test_the_bound_is_that_of_the_programme_written_out(d, up):
     for seed in range(3):
         problem = swarm(seed, d=d, vehicles=3, stretch=up)
         assert quadratic(problem).stacked == (up != 1.0)
-        assert shor(problem, refine=False).lower_bound == pytest.approx(by_hand(problem), rel=2e-5, abs=1e-6)
+        assert shor(problem).lower_bound == pytest.approx(by_hand(problem), rel=2e-5, abs=1e-6)
 
 
 SWARMS = (swarm, partial(swarm, d=2), partial(swarm, stretch=UP))

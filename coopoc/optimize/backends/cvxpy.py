@@ -7,18 +7,16 @@ from ..convex.relaxation import shor
 from ..model.problem import Problem
 
 
-def solver(problem: Problem, x: Floats, refine: bool = True) -> SolverResult:
+def solver(problem: Problem, x: Floats) -> SolverResult:
     """Solve a problem.
 
     Args:
         problem: that is solved.
         x: start, which a relaxation does not need.
-        refine: from the rounded point to a minimum by gauss-newton; without it the answer is the relaxation's own.
     """
-    found = shor(problem, refine)
-    end = (found.x, 0) if found.solution is None else (found.solution.x, found.solution.iterations)
+    found = shor(problem)
     extras = {"lower_bound": found.lower_bound, "rank_gap": found.rank_gap, "rounded_cost": found.cost}
-    return SolverResult(*end, extras=extras | {"refined": refine})
+    return SolverResult(found.solution.x, found.solution.iterations, extras=extras)
 
 
 BACKEND = Backend(

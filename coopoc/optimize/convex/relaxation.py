@@ -44,7 +44,7 @@ class Relaxation:
         rank_gap: eigenvalue d + 1 over eigenvalue d of Z (second over first where the columns are stacked): 0 if tight.
         x: (n, ambient) the rounded point, m and rotations.
         cost: of it.
-        solution: refined from it by Gauss-Newton; None if that was not asked for.
+        solution: refined from it by Gauss-Newton.
         seconds: in all.
     """
 
@@ -52,7 +52,7 @@ class Relaxation:
     rank_gap: float
     x: Floats
     cost: float
-    solution: Solution | None
+    solution: Solution
     seconds: float
 
     __repr__ = short_repr
@@ -60,8 +60,7 @@ class Relaxation:
     @property
     def gap(self) -> float:
         """Cost of the best point found less the bound, at least 0."""
-        best = self.cost if self.solution is None else min(self.cost, self.solution.cost)
-        return max(best - self.lower_bound, 0.0)
+        return max(min(self.cost, self.solution.cost) - self.lower_bound, 0.0)
 
     @property
     def tight(self) -> bool:
@@ -69,7 +68,7 @@ class Relaxation:
         return self.gap <= TIGHT * max(self.lower_bound, 1.0)
 
 
-def shor(problem: Problem, refine: bool = True) -> Relaxation:
+def shor(problem: Problem) -> Relaxation:
     """Shor's semidefinite relaxation by CVXPY and Clarabel, rounded and refined.
 
     minimise 1/2 <C, Z> over Z >= 0 with Z_BB = I on Stiefel blocks, tr Z_BB = 1 on spheres. For scalar weights Z has
@@ -79,7 +78,6 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
 
     Args:
         problem: one that `quadratic` takes.
-        refine: follow by `solve` from the rounded point.
 
     Raises:
         InputError: as `quadratic`, or more than MAX_SHOR_ROWS constrained rows.
@@ -102,11 +100,11 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
     _, values, rows = np.linalg.svd(Y, full_matrices=False)
     gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
     top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
-    x, solution = space.join(*form.drop(reduced.settle(form.project(top)))), None
-    if refine:  # the refined point's own bound never exceeds Shor's but by what the solver lacks
-        solution = solve(replace(problem, x0=x), throw=False)
-        X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
-        bound = max(bound, reduced.lower_bound(multipliers(form, X, reduced.times(X)))[0])
+    x = space.join(*form.drop(reduced.settle(form.project(top))))
+    solution = solve(replace(problem, x0=x), throw=False)
+    X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
+    # the refined point's own bound never exceeds Shor's but by what the solver lacks
+    bound = max(bound, reduced.lower_bound(multipliers(form, X, reduced.times(X)))[0])
     return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
 
 
