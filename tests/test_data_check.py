@@ -346,7 +346,8 @@ def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words
     off = 0.2 * (fault == "tunnel") * (t > 600) * (t < 660)
     measured = {"speed": (v * (1.02 if fault == "wheels" else 1.0), 0.05), "heading": (heading + off, 0.01)}
     odometry, seen = noisy(rng, t, "a", measured), noisy(rng, t, "a", {"x": (x.real, 2.0), "y": (x.imag, 2.0)})
-    write(pd.concat([odometry, seen[::60]]), tmp_path / "log.csv")
+    table = pd.concat([odometry, seen[::60]])
+    write(table.assign(lidar=1.0) if fault == "tunnel" else table, tmp_path / "log.csv")  # "a" is in all sentences
     found = re.search(words, said(read_log(tmp_path)))
     assert found
     for option in found.groups():

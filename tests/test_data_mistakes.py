@@ -210,9 +210,10 @@ def test_separators_and_decimal_commas_change_nothing(tmp_path, text, mark, poin
     assert same(co.read_log(tmp_path / "a.csv").recording, co.read_log(tmp_path / "b.csv").recording)
 
 
-@pytest.mark.parametrize("option", ["", "?columns=t:stamp.sec"])
-def test_seconds_and_nanoseconds_of_a_stamp_are_one_time(tmp_path, option):
-    text = re.sub(r"(?m)^(\d)\.(\d)", r"\1,\g<2>00000000", WIDE.replace("t,", "stamp.sec,stamp.nanosec,", 1))
+@pytest.mark.parametrize(("option", "time"), [("", ""), ("?columns=t:stamp.sec", ""), ("?columns=t:time", "time,")])
+def test_seconds_and_nanoseconds_of_a_stamp_are_one_time(tmp_path, option, time):
+    text = WIDE.replace("t,", f"{time}stamp.sec,stamp.nanosec,", 1)
+    text = re.sub(r"(?m)^(\d)\.(\d)", r"\1.\2," * bool(time) + r"\1,\g<2>00000000", text)
     (tmp_path / "a.csv").write_text(WIDE)
     (tmp_path / "b.csv").write_text(text)
     assert same(co.read_log(tmp_path / "a.csv").recording, load_log(f"{tmp_path / 'b.csv'}{option}").recording)

@@ -29,13 +29,13 @@ from .estimates import (
     causes,
     factors,
     lag_of_fixes,
+    median,
     moves,
     odometry,
     on_time,
     ratio_of_moves,
     worst,
 )
-from .estimates import median as median_of
 from .motion import CLOCKWISE, HOLDS
 from .read import Log
 from .relative import (
@@ -72,6 +72,8 @@ USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of reasons that are no fault of the log."""
+FAULTS = "stamps of", CLOCKWISE.split("{")[0]
+"""Beginnings of what is assumed that is a fault."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
     "repeated rows": "Do stamps lack a fraction, as stamp.sec without nanosec, or in 32 bits? Do two share a name?",
@@ -98,9 +100,9 @@ def check(log: Log) -> Check:
     first = filtered(log)
     first = without_wild(replace(first, failing=_failing(first) if log.recording.body is None else {}))
     rows = _vehicles(first)
-    wrong = ([row["vehicle"] for row in rows if off(row) or row["vehicle"] in first.failing] for off in (_off, _drifts))
-    errs, drifts = ([*map(first.world.ids.index, names)] for names in wrong)
-    result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
+    drifts = [first.world.ids.index(row["vehicle"]) for row in rows if _drifts(first, row)]
+    alike = not drifts and not any(_beyond(row, "nis", OUTLYING) for row in rows)
+    result = on_time(first if log.recording.body else _without(first, drifts), alike)
     result = replace(result, vehicles=_vehicles(result))
     if (
         log.truth is not None
@@ -142,11 +144,8 @@ def _wider(c: Check) -> Check:
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
     rows, rec, truth = [], c.world, c.log.truth
-    turned, late = (
-        "turned" if c.log.recording.body is None else "yaw_rate_bias",
-        "fixes_late_s" if truth is None else "late_s",
-    )
-    errors = {"speed_excess": 0, "beside_east": 3, "beside_north": 4, turned: 1, late: 2}
+    turned = "turned" if c.log.recording.body is None else "yaw_rate_bias"
+    errors = "speed_excess", turned, "fixes_late_s" if truth is None else "late_s", "beside_east", "beside_north"
     for column, name in enumerate(rec.ids):
         fixed = np.isfinite(c.normalised[:, column])
         speed, fixes = np.linalg.norm(rec.velocity[0, :, column], axis=-1), pd.DataFrame(rec.gnss[0, :, column])
@@ -162,10 +161,10 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
             "fixes_per_odometry": None if ratio is None else abs(ratio),
             "turned_deg": None if ratio is None else float(np.angle(ratio, deg=True)),
             **{
-                f"{error}{end}": float(values[k])
-                for error, k in errors.items()
-                if np.isfinite(wheels.error[k])
-                for end, values in (("", wheels.value), ("_error", wheels.error))
+                f"{error}{end}": float(number)
+                for error, *numbers in zip(errors, *wheels, strict=True)
+                if np.isfinite(numbers[1])
+                for end, number in zip(("", "_error"), numbers, strict=True)
             },
             "clock_s": float(c.ahead[column]) if np.isfinite(c.unsure[column]) else None,
             "std_m": _rms(np.sqrt(c.variance[:, column])),
@@ -233,9 +232,8 @@ def _of_rows(c: Check) -> list[str]:
             + f" (first: {first})" * bool(first)
             + f". {hint}".rstrip(" ")
         )
-    mirrored = summary.assumed.get(CLOCKWISE, ())
-    sentences += [f"{sentence}." for sentence in summary.sentences if sentence.startswith("stamps of")]
-    return [*sentences, *filter(None, [CLOCKWISE.format(", ".join(mirrored)) * bool(mirrored), summary.unread])]
+    sentences += [f"{sentence}." for sentence in summary.sentences if sentence.startswith(FAULTS)]
+    return [*sentences, *filter(None, [summary.unread])]
 
 
 def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
@@ -245,7 +243,7 @@ def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
         f"{row['worst_at_s']:.3g} s on: by what other lines name, or by noise that is not as stated."
         for row in sorted(c.vehicles, key=lambda row: -row["per_std"])
         if row["per_std"] > CONFIDENT_RATIO
-        and (row["misses"] == "filter errs" or not any(row["vehicle"] in sentence for sentence in named))
+        and (row["misses"] == "filter errs" or not any(one.startswith(f"{row['vehicle']}: ") for one in named))
     ]
 
 
@@ -342,15 +340,10 @@ def _late(c: Check, row: Mapping[str, Any]) -> bool:
     return _beyond(row, "late_s", max(LEAST_LAG, 0.5 * c.world.dt))
 
 
-def _drifts(row: Mapping[str, Any]) -> bool:
+def _drifts(c: Check, row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row errs."""
     errors = ("speed_excess", LEAST_SCALE), ("turned", LEAST_TURN), ("yaw_rate_bias", LEAST_DRIFT)
-    return any(_beyond(row, *one) for one in errors)
-
-
-def _off(row: Mapping[str, Any]) -> bool:
-    """Whether the odometry of a row errs, or fixes do not fit it."""
-    return _beyond(row, "nis", OUTLYING) or _drifts(row)
+    return row["vehicle"] in c.failing or any(_beyond(row, *one) for one in errors)
 
 
 def _of_clocks(c: Check) -> list[str]:
@@ -433,7 +426,7 @@ def _of_fixes(c: Check) -> list[str]:
         both = np.isfinite(every[:, 0])
         if both.sum() < LEAST_FIXES:
             continue
-        east, north, up = (median_of(axis) for axis in every[both].T)
+        east, north, up = (median(axis) for axis in every[both].T)
         if np.ptp(rec.gnss[0, both, column, 2]) and abs(up[0]) > max(OFFSET_ERRORS * up[1], rec.sensors.fix_std[2] / 2):
             sentences.append(
                 f"{name}: fixes lie {up[0]:.3g} m above the truth in the median. Is one of the two above the "

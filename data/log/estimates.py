@@ -151,8 +151,7 @@ def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     """What is of each step, of the one two samples of the odometry later, as two steps may share one; the last at the
     end."""
     later = 2 * max(round(c.log.summary.odometry / c.world.dt), 1)
-    at = np.minimum(np.arange(of_step.shape[axis]) + later, of_step.shape[axis] - 1)
-    return np.asarray(of_step.take(at, axis))
+    return of_step.take(np.arange(of_step.shape[axis]) + later, axis, mode="clip")
 
 
 def moves(c: Check, column: int, means: int = 1) -> AnyArray:
@@ -383,8 +382,6 @@ def lag_of_fixes(c: Check, column: int) -> float:
 def _beside(off: AnyArray, velocity: AnyArray) -> float:
     """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none."""
     finite = np.isfinite(off + velocity)
-    if not finite.any():
-        return 0.0
     x = np.column_stack([np.ones(finite.sum()), velocity[finite]])
     return float(abs(np.linalg.lstsq(x, off[finite])[0][0]))
 

@@ -211,6 +211,6 @@ def _other_angle(c: Check) -> str:
 
 def when(t: Floats, bad: Ints) -> str:
     """The part of a drive with samples at t (M,) s that holds those which are bad, if it is one, in words."""
-    if len(bad) < MEDIAN_WINDOW or len(bad) < WRONG_SHARE * (bad[-1] - bad[0]) or len(bad) > WRONG_SHARE * len(t):
+    if not WRONG_SHARE * (bad[-1] - bad[0]) <= len(bad) <= WRONG_SHARE * len(t):
         return ""
     return f" from {t[bad[0]]:.3g} to {t[bad[-1]]:.3g} s"

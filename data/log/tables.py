@@ -69,7 +69,7 @@ def read_log_table(
     """
     file = path.name
     frame = read_frame(path, *(columns.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
-    frame = _with_whole_stamps(frame)
+    frame = _with_whole_stamps(frame, columns)
     frame = named_columns(frame, columns, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame:
         placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
@@ -86,14 +86,14 @@ def read_log_table(
     return rows
 
 
-def _with_whole_stamps(frame: pd.DataFrame) -> pd.DataFrame:
+def _with_whole_stamps(frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
     """The frame with stamps of whole seconds and nanoseconds beside them, as of ROS, in one column: t, if none is."""
-    for name in frame.select_dtypes("number"):
+    numbers = frame.select_dtypes("number")
+    for name in numbers:
         found = re.fullmatch(r"(.*?)n(?:ano)?(secs?)", str(name))
-        if found and (whole := found[1] + found[2]) in frame.select_dtypes("number"):
-            stamps = {whole: frame[whole] + 1e-9 * frame[name]}
-            frame = frame.assign(**stamps).drop(columns=name)
-            return frame if "t" in frame else frame.rename(columns={whole: "t"})
+        if found and (whole := found[1] + found[2]) in numbers:
+            frame = frame.assign(**{whole: frame[whole] + 1e-9 * frame[name]}).drop(columns=name)
+            return frame if {"t", columns.get("t")} & {*frame} else frame.rename(columns={whole: "t"})
     return frame
 
 
