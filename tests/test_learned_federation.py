@@ -324,11 +324,6 @@ def test_a_rule_holds_as_many_byzantine_clients_as_it_tolerates_and_no_more(name
     assert moved > 1e4
 
 
-def test_a_federation_says_how_many_it_tolerates(four):
-    assert trained(four, 1, aggregate="trimmed_mean").tolerated == 1
-    assert trained(four, 1).tolerated == 0
-
-
 def test_a_plain_function_is_a_rule():
     weights = answers()
     torch.testing.assert_close(combined(rule(lambda w, n: w[0]), weights), weights[0])

@@ -61,11 +61,6 @@ class Plan:
             actual, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
             raise InputError("aggregate", actual, allowed, "Ask more clients, or take the median.")
 
-    def tolerated(self, names: Sequence[str]) -> int:
-        """Number of Byzantine clients of a round that the rule withstands."""
-        self.check(len(names))
-        return self.rule.tolerated(self.participation.count(len(names)))
-
 
 @one_core()
 def federate(
@@ -84,8 +79,7 @@ def federate(
 
     theta_i = fit(theta_g, D_i);  theta_g = sum_i a_i theta_i. A local epoch is a pass over the client's own pieces; the
     optimiser starts anew each round and its rate falls over all rounds. Clients send weights and one validation loss.
-    Implausible answers are rejected with a reason and training goes on. The federation says how many Byzantine clients
-    its rule tolerates; where more are simulated, a warning does, if it tolerates any.
+    Implausible answers are rejected with a reason and training goes on.
 
     Args:
         model: start, not changed: a net, a class of nets, a name in `coopoc.nets` or a path "mine.py:NAME".
@@ -117,7 +111,7 @@ def federate(
     instance("model", start, Gain, "Give GainNet(), or its name.")  # type: ignore[type-abstract]
     began, plan = time.perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
     names = _names(clients)
-    tolerated = plan.tolerated(names)
+    plan.check(len(names))
     judge = Judge([[client.validation for client in clients], [client.long for client in clients]], start)
 
     def validated(theta: Tensor) -> tuple[float, ...]:
@@ -151,7 +145,7 @@ def federate(
         )
         history.append(row)
     sizes, seconds = tuple(len(client.training) for client in clients), time.perf_counter() - began
-    return Federation(start, tuple(history), sizes, seconds, names, tolerated)
+    return Federation(start, tuple(history), sizes, seconds, names)
 
 
 def _names(clients: Sequence[Client]) -> tuple[str, ...]:

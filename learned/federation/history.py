@@ -82,7 +82,6 @@ class Federation:
         sizes: (C,) training pieces of each client.
         seconds: of training.
         names: (C,) of the clients.
-        tolerated: Byzantine clients of a round that the rule withstands.
     """
 
     like: Gain
@@ -90,7 +89,6 @@ class Federation:
     sizes: tuple[int, ...]
     seconds: float
     names: tuple[str, ...] = ()
-    tolerated: int = 0
 
     __repr__ = short_repr
 
