@@ -14,7 +14,7 @@ import numpy as np
 from tabulate import tabulate
 
 import coopoc as co
-from coopoc.evaluate.metrics import nees_inside
+from coopoc.evaluate.metrics import share_of_average
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 
 ORDER = (
@@ -40,7 +40,7 @@ def row(name: str, fleet: co.Fleet, recording: co.Recording, egos: tuple[int, ..
         name,
         float(co.rt_le(track, fleet).mean()),
         float(np.nanmean(co.nees(track, fleet))) if claims else None,
-        float(nees_inside(track, fleet).mean()) if claims else None,
+        float(share_of_average(co.nees(track, fleet).mean(axis=0), recording.runs).mean()) if claims else None,
         float(track.received_bytes.mean() / duration),
         float(track.sent_bytes.mean() / duration),
         1e3 * track.seconds / len(track.t) / recording.runs / served,

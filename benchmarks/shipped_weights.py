@@ -14,7 +14,7 @@ import torch
 
 from coopoc.data.registry import load_fleet
 from coopoc.errors import unknown
-from coopoc.evaluate.metrics import nees_inside, rt_le
+from coopoc.evaluate.metrics import nees, rt_le, share_of_average
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of
@@ -117,7 +117,7 @@ def metrics(method: Method, runs: int = 20) -> dict[str, dict[str, float]]:
         ours = float(rt_le(track, fleet).mean())
         rows[name] = {"rt_le_m": ours, "times_oracle": ours / float(rt_le(oracle, fleet).mean())}
         if track.covariance is not None and sensors.gnss_bias[1] == 0:
-            rows[name]["nees_inside"] = float(nees_inside(track, fleet).mean())
+            rows[name]["nees_inside"] = float(share_of_average(nees(track, fleet).mean(axis=0), recording.runs).mean())
     return {name: {key: round(value, 4) for key, value in row.items()} for name, row in rows.items()}
 
 

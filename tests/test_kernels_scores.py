@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from coopoc import V2X, JointFilter, Kalman, Sensors, observe
 from coopoc.evaluate import scores
-from coopoc.evaluate.metrics import errors, nees, nees_inside
+from coopoc.evaluate.metrics import errors, nees, share_of_average
 
 S2 = Sensors.paper_scenario2()
 
@@ -30,7 +30,7 @@ def test_runs_are_scored_by_fours(crossing, monkeypatch):
     assert_allclose(found["error_quantiles_m"][..., 2], found["max_error_m"])
     whole = JointFilter()(seen, ["c0", "c5"])
     assert_allclose(found["nees"], nees(whole, crossing).mean(axis=1), rtol=1e-12)
-    assert_allclose(found["nees_inside"][0], nees_inside(whole, crossing))
+    assert_allclose(found["nees_inside"][0], share_of_average(nees(whole, crossing).mean(axis=0), seen.runs))
 
 
 def test_a_start_that_is_known_has_no_nees(crossing):

@@ -113,14 +113,9 @@ def nees_band(runs: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def nees_inside(track: Track, fleet: Fleet) -> Floats:
-    """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
-    squares = nees(track, fleet)
-    return share_of_average(squares.mean(axis=0), len(squares))
-
-
 def share_of_average(average: Floats, runs: int) -> Floats:
-    """`nees_inside` of the average over `runs` runs of what `nees` has found, (T, E); NaN does not count.
+    """Share (E,) of the steps at which the average over `runs` runs of what `nees` has found, (T, E), lies in the band;
+    >= 0.95 passes the consistency gate. NaN does not count.
 
     >>> share_of_average(np.array([[3.0], [9.0]]), 30)
     array([0.5])
