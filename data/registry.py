@@ -106,7 +106,7 @@ MEASURED = {".npz": "recording", ".pyfg": "pyfg"}
 ENDINGS = {**dict.fromkeys(TABLES, "table"), ".xml": "fcd", ".tum": "tum", ".txt": "tum"}
 
 
-def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
+def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
     """Fleet of a bundled dataset or of a file or folder.
 
     Args:
@@ -114,9 +114,9 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
             CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, or a log with a truth (`read_log`). Options may stand behind
             a question mark, as in "drive.csv?dt=0.1&columns=t:time".
-        format: one of DRIVES or LOGS, instead of the one found from name and contents.
         options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, scale; of all, since and
-            until, s after the first step, of the part that is kept.
+            until, s after the first step, of the part that is kept, and format, one of DRIVES or LOGS, instead of the
+            one found from name and contents.
 
     Raises:
         InputError: an unknown name (the message lists all), an unknown format or option, or a file with a fault.
@@ -125,8 +125,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     array([1550, 4600, 1450, 1420])
     """
     name, options, part = _split(name_or_path, options)
-    stated = options.pop("format", None)
-    chosen = stated if format is None else format
+    chosen = options.pop("format", None)
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
         if options:
             raise InputError("options", sorted(options), f"{name} is bundled and takes none", "Leave them out.")
