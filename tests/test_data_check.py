@@ -333,6 +333,7 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     ("fault", "words"),
     [
         ("wheels", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
+        ("wheels in km/h", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
         ("current", r"(offset=a\.vx:-0\.[23]\d*,a\.vy:\S+) takes it off"),
         ("tunnel", r"a: its fixes are off by \d\S+ times what its filter states from [67]\d\d s on"),
     ],
@@ -344,7 +345,9 @@ def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words
     u = v * np.exp(1j * heading) + 0.3 * (fault == "current")
     x = np.cumsum(u) - 0.5 * u
     off = 0.2 * (fault == "tunnel") * (t > 600) * (t < 660)
-    measured = {"speed": (v * (1.02 if fault == "wheels" else 1.0), 0.05), "heading": (heading + off, 0.01)}
+    kind, unit = ("speed_kmh", 3.6) if "km/h" in fault else ("speed", 1.0)
+    wheels = unit * v * (1.02 if "wheels" in fault else 1.0), unit * 0.05
+    measured = {kind: wheels, "heading": (heading + off, 0.01)}
     odometry, seen = noisy(rng, t, "a", measured), noisy(rng, t, "a", {"x": (x.real, 2.0), "y": (x.imag, 2.0)})
     table = pd.concat([odometry, seen[::60]])
     write(table.assign(lidar=1.0) if fault == "tunnel" else table, tmp_path / "log.csv")  # "a" is in all sentences

@@ -149,7 +149,7 @@ def read_log(
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
         scale: kind, of all or one vehicle, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and
-            ms, {"car1.speed": 0.98} of its wheels.
+            ms, {"car1.speed": 0.98} of its wheels, if none is logged also of what is the same in another unit.
         offset: kind, of all or one vehicle, or pair, in its unit here -> what these measurements, or the pair's ranges,
             are too large by, as {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; vx, vy also
             of velocities that are speeds along a heading, as in a current of -vx, -vy.
@@ -200,8 +200,13 @@ def read_log(
     rows = _rows(path, truth, summary, options)
     own, ends = rows["vehicle"] + "." + rows["kind"], (rows["vehicle"], rows["partner"])
     names = *KINDS, *own.unique(), *(f"{name}.{kind}" for name in ends[0].unique() for kind in VELOCITIES)
-    factor = factors(scale, ("t", *names))
-    by_kind = rows["kind"].mask(own.isin(factor), own).map(factor).fillna(1.0)
+    quantity = rows["kind"].map({kind: KINDS[kind].name for kind in KINDS})
+    of_one = rows["vehicle"] + "." + quantity
+    factor = factors(scale, ("t", *names, *of_one.unique()))
+    by_kind = pd.Series(1.0, rows.index)
+    for kinds_of, like in ((rows["kind"], quantity), (own, of_one)):
+        for key in (like.mask(like.isin(kinds_of)), kinds_of):
+            by_kind = key.map(factor).fillna(by_kind)
     key = rows["kind"].mask(own.isin(offset), own)
     for one, other in (ends, ends[::-1]):
         pair = one + "-" + other
