@@ -319,6 +319,12 @@ def test_what_moves_half_of_the_time_is_no_outlier(tmp_path):
     assert re.search(r"its odometry is turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg", sentences)
 
 
+def test_a_forward_axis_that_points_back_is_no_late_odometry(tmp_path):
+    """Of speeds that count backwards it was 0.2 s early beside the truth."""
+    log = turned_drive(tmp_path / "log", lambda t: 10 + 4 * np.sin(t / 2), np.pi)
+    assert re.fullmatch(r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*", said(read_log(log)))
+
+
 def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     """Whatever the seed of the noise, an error of 1.7 degrees is named, or said to be perhaps one."""
     for seconds in (70, 80, 90):

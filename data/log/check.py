@@ -190,9 +190,9 @@ def _axes(c: Check, column: int) -> str:
     moved, driven, *_ = moves(c, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
     u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
-    height, climbed = rec.gnss[0, :, column, 2], np.cumsum(np.nan_to_num(rec.velocity[0, :, column, 2])) * rec.dt
-    up, climbed = (each[np.isfinite(height)] for each in (height, climbed))
-    if len(up) > LEAST_COUNT and np.ptp(climbed) > 4 * rec.sensors.fix_std[2] and np.corrcoef(up, climbed)[0, 1] < -0.9:
+    height = pd.Series(rec.gnss[0, :, column, 2]).dropna()
+    climbed = pd.Series(rec.velocity[0, :, column, 2] * rec.dt).cumsum()[height.index]
+    if height.corr(climbed, min_periods=LEAST_COUNT + 1) < -0.9 and np.ptp(climbed) > 4 * rec.sensors.fix_std[2]:
         return "heights of fixes fall where vz is positive: it counts upwards, so that scale=vz:-1 mends it."
     if not size or abs(np.vdot(driven, moved)) > LEAST_CORRELATION * size:
         return ""

@@ -20,6 +20,8 @@ LEAST_LAG, LEAST_SCALE, LEAST_TURN, LEAST_DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 BESIDE, BEHIND = 0.1, 0.1
 """m/s, least velocity across that of the odometry, and s, least lag of fixes behind it, that are reported."""
+LEAST_FORWARD = 0.1
+"""Share of a velocity along which odometry counts, or back, that shows by what it is late."""
 UNITS_APART = 0.2
 """Relative error of lengths from which their unit is wrong."""
 LEAST_COUNT, FEWEST = 20, 6
@@ -244,9 +246,11 @@ def odometry(c: Check, column: int) -> Estimate:
     used &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
     constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), np.linalg.norm(noise) / len(noise) ** 0.5
     value, error = _of_motion((odometer - true)[used], x[:, used], constant, usual)
-    late = -value[2] / max(1 + value[0], 0.1)
+    forward = 1 + value[0]
+    late = -value[2] / forward if abs(forward) > LEAST_FORWARD else np.inf
     value[:3] = *_polar(1 + complex(*value[:2])), late
-    error[2] = error[2] if abs(late) < LONG_LAG else np.inf  # what is linear in a lag holds for small ones
+    sure = abs(late) < LONG_LAG  # what is linear in a lag holds for small ones
+    error[2] = error[2] / abs(forward) if sure else np.inf
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
@@ -323,10 +327,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
 def share(c: Check) -> float:
     """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
     fixes, noise = np.isfinite(c.normalised).sum(axis=0), np.square(c.world.sensors.fix_std[:2]).mean()
-    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
-    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
-    ratio = (variance + noise) / np.maximum(variance * fixes, 1e-12)
-    return min(2 * float(np.nanmax(ratio, where=variance > 0, initial=0.0)), 1.0)
+    variance = pd.DataFrame(c.variance[..., :2].mean(axis=2)).mean()
+    ratio = (variance + noise) / (variance * fixes).clip(1e-12)
+    return min(2.0 * float(ratio.where(variance > 0.0, 0.0).max()), 1.0)
 
 
 def median(values: Floats) -> tuple[float, float]:
@@ -367,9 +370,9 @@ def lag_of_fixes(c: Check, column: int) -> float:
     path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
     path = path if truth is None else plane(truth.position[:, column])
     there = np.isfinite(fixes)
-    lags = LAG_STEP * np.arange(-LONGEST_LAG // LAG_STEP, LONGEST_LAG // LAG_STEP + 1)
-    moved = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, np.nan, np.nan) for lag in [0.0, *lags])]
-    moved = np.subtract(*(np.stack(moved)[:, part] for part in (slice(LEAST_COUNT, None), slice(-LEAST_COUNT))))
+    lags = np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
+    places = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, np.nan, np.nan) for lag in [0.0, *lags])]
+    moved = np.stack(places)[:, LEAST_COUNT:] - np.stack(places)[:, :-LEAST_COUNT]
     off = np.abs(moved[0] - moved[1:])
     misses = np.where(np.isfinite(off).sum(axis=1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), np.inf)
     now, least, misses = misses[0], misses.min(), misses[1:]

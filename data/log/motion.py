@@ -191,7 +191,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     shown, (derived, mirrored) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
-        world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
+        world, ever = samples(rows, VELOCITIES[:2], Summary(), 2), steps._replace(max_gap=np.inf)
         pointing = _heading(measured, world, shown, derived, way, ever)
         if pointing.at is unknown or not np.isfinite(off).all():
             raise InputError(
@@ -218,7 +218,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
                     "must have speeds and yaw rates in body frames",
                     'Log both, or pass frame="world".',
                 )
-        summary.refuse("world velocities in body frames", only(rows, "vx", "vy", "vz"))
+        summary.refuse("world velocities in body frames", only(rows, *VELOCITIES))
         signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
         along = _heading(measured, None, shown, derived, way, steps)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]

@@ -107,20 +107,23 @@ def of_measurements(c: Check) -> list[str]:
             if scaled := other and (varied or usual) and robust_std(ratios) < 0.2 * ratio:
                 power = round(np.log10(ratio))
                 unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
-                unit_text = f"scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."
-                hint = f"They are {ratio:.3g} times as long: {unit_text}"
+                hint = (
+                    f"They are {ratio:.3g} times as long: scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); "
+                    "then check again."
+                )
         k = list(UNITS).index(name)
         misfits = _misfits(c, k)
-        apart = {f"{a} to {b}" if k else f"{a} and {b}" for pair in misfits for a, b in (pair, pair[:: 1 if k else -1])}
+        apart = {(" to " if k else " and ").join(ends) for pair in misfits for ends in (pair, pair[:: 1 if k else -1])}
         pairs = [one for one in _named(c, k, least) if one[0] not in apart]
         if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / number) and not scaled and not misfits:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
             )
-        if wrong and not (misfits and hint == HINTS[name]):
+        of_pairs = misfits and (not wrong or hint == HINTS[name])
+        if wrong and not of_pairs:
             sentences.append(f"{word}s miss the positions by {stated}. {hint}")
-        if misfits and (not wrong or hint == HINTS[name]):
+        if of_pairs:
             count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
             ends = set.intersection(*map(set, misfits))
             one = "".join(ends) if len(ends) == 1 else ""
