@@ -85,7 +85,8 @@ def _fields(entry: Entry) -> dict[str, str]:
         f"{file}, {size:,} bytes": f"{address} {digest}".strip()
         for file, (address, size, digest) in entry.files.items()
     }
-    fetched = {"fetched": str(entry.path) if entry.fetched else f"no: coopoc data get {entry.name}"}
+    how = entry.by_hand or f"no: coopoc data get {entry.name}"
+    fetched = {"fetched": str(entry.path) if entry.fetched else how}
     return stated | {"addresses": entry.tried} | fetched | files
 
 

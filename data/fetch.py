@@ -37,6 +37,7 @@ class Entry:
         files: path below the folder of the name -> (address, bytes, SHA-256).
         archive: address of a ZIP archive with all files, "" if each has its own.
         opens: what `fetch` returns, below the folder of the name.
+        by_hand: what to do where no address serves the files, which then have no hashes either.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Entry:
     files: Mapping[str, tuple[str, int, str]]
     archive: str = ""
     opens: str = ""
+    by_hand: str = ""
 
     @property
     def folder(self) -> Path:
@@ -67,7 +69,7 @@ class Entry:
     @property
     def fetched(self) -> bool:
         """Whether every file is there with its bytes."""
-        return not self.absent()
+        return not self.by_hand and not self.absent()
 
     def absent(self) -> list[str]:
         """Files that are not there, or with other bytes."""
@@ -162,6 +164,8 @@ def fetch(name: str) -> Path:
     entry = public().get(name) if isinstance(name, str) else None
     if entry is None:
         raise unknown("data", name, public())
+    if entry.by_hand:
+        raise InputError("data", repr(name), f"is served by {entry.page} alone, to its users", entry.by_hand)
     from filelock import FileLock
 
     if not entry.fetched:
