@@ -89,10 +89,10 @@ def correct(states: Floats, velocity: Floats, dt: float) -> float:
     """
     if len(states) == 0 or math.isnan(states[0, PLACE]):
         return 0.0
-    for state in states:
-        state[WAY] += dt * velocity[0]
-        state[WAY + 1] += dt * velocity[1]
-        state[SINCE] += dt
+    for i in range(len(states)):
+        states[i, WAY] += dt * velocity[0]
+        states[i, WAY + 1] += dt * velocity[1]
+        states[i, SINCE] += dt
     i = failing(states)
     if i < 0:
         return 0.0
@@ -110,8 +110,8 @@ def judge(states: Floats, x: float, y: float, r: float, dt: float) -> float:
     if len(states) == 0 or math.isnan(x):
         return 0.0
     before, gap2 = failing(states), 0.0
-    for state in states:
-        gap2 = max(gap2, judge_pace(state, x, y, r, dt))
+    for i in range(len(states)):
+        gap2 = max(gap2, judge_pace(states[i], x, y, r, dt))
     return gap2 if before < 0 else 0.0
 
 
@@ -119,7 +119,8 @@ def judge(states: Floats, x: float, y: float, r: float, dt: float) -> float:
 def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     """The square, m^2, of the gap between both filters of a pace at a fix from which on the odometry fails, else 0."""
     if math.isnan(state[PLACE]):
-        state[:BASE] = 0.0
+        for i in range(BASE):
+            state[i] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE_UNTIL], state[LEVEL] = r, 1.0, r, UNKNOWN
         state[PLACE] = state[BELIEVED] = state[BEFORE] = state[FIX] = x
         state[PLACE + 1] = state[BELIEVED + 1] = state[BEFORE + 1] = state[FIX + 1] = y
@@ -230,13 +231,15 @@ def correct_drives(
     fails = False
     for run in range(gnss.shape[0]):
         for e in range(len(columns)):
-            states[e] = fresh
+            for i in range(fresh.size):
+                states[e, i // SIZE, i % SIZE] = fresh[i // SIZE, i % SIZE]
         for t in range(gnss.shape[1]):
             for e in range(len(columns)):
                 n, extra, state = columns[e], 0.0, states[e]
                 moved[0], moved[1] = velocity[run, t, n, 0], velocity[run, t, n, 1]
                 if math.isnan(moved[0]):
-                    state[:, PLACE] = math.nan
+                    for i in range(len(state)):
+                        state[i, PLACE] = math.nan
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)
