@@ -332,6 +332,7 @@ def _api() -> Iterator[tuple[str, str]]:
     lines = ["# API reference", "", "The public names of `import coopoc as co`.", ""]
     for room, (title, words) in SECTIONS.items():
         mine = [(module, name) for module, name in homes if module.split(".")[0] == room]
-        yield f"api/{room}.md", "\n".join([f"# {title}", "", *(f"::: coopoc.{m}.{n}\n" for m, n in mine)])
+        above = "" if room == "data" else "coopoc."  # in the sources that folder stands beside the package
+        yield f"api/{room}.md", "\n".join([f"# {title}", "", *(f"::: {above}{m}.{n}\n" for m, n in mine)])
         lines.append(f"- [{title}]({room}.md): {words} " + ", ".join(f"`{name}`" for _, name in mine))
     yield "api/index.md", "\n".join([*lines, ""])
