@@ -5,8 +5,8 @@ adds a velocity error b, a random walk. By how much likelier the second makes a 
 begins anew at a fix that is far beyond it: a receiver that jumps, and stays displaced, moves as the odometry says. From
 DECISIVE on, if b is more than heading and scale err by, motions are corrected by b, until no evidence is left.
 
-This is done for each of two PACES of the random walk. The slow one finds errors of a tenth of the way, which last; the
-fast one those that begin and change at once, and are large.
+This is done for each of two PACES of the random walk. The slow one finds errors of a twentieth of the way that last;
+the fast one those that are large, and begin and change at once.
 
 A receiver whose error grows steadily, by many of its deviations, looks the same to a vehicle that is alone.
 
@@ -231,8 +231,9 @@ def correct_drives(
     fails = False
     for run in range(gnss.shape[0]):
         for e in range(len(columns)):
-            for i in range(fresh.size):
-                states[e, i // SIZE, i % SIZE] = fresh[i // SIZE, i % SIZE]
+            for pace in range(len(fresh)):
+                for i in range(SIZE):
+                    states[e, pace, i] = fresh[pace, i]
         for t in range(gnss.shape[1]):
             for e in range(len(columns)):
                 n, extra, state = columns[e], 0.0, states[e]
