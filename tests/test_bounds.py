@@ -110,15 +110,16 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(nei
         for o in (co.Outliers(), WRONG)
     )
 
-    def bound(seen):
+    def bound(seen, smoothing=False):
         if everyone:
-            return fleet_bound(crossing, S2, v2x, recording=seen)[:, 0]
-        return posterior_bound(crossing, S2, 0, v2x, recording=seen)
+            return fleet_bound(crossing, S2, v2x, smoothing=smoothing, recording=seen)[:, 0]
+        return posterior_bound(crossing, S2, 0, v2x, smoothing=smoothing, recording=seen)
 
-    one = bound(told.of_runs(slice(0, 1)))
+    one, smooth = (bound(told.of_runs(slice(0, 1)), smoothing) for smoothing in (False, True))
     for t in (3, 17, 41):
-        expected = point_marginals(crossing, t + 1, v2x, who, told).marginalCovariance(gtsam.symbol("a", t))
-        assert one[t] == pytest.approx(expected, rel=1e-3, abs=1e-6)
+        for found, end in ((one, t + 1), (smooth, len(crossing.t))):
+            expected = point_marginals(crossing, end, v2x, who, told).marginalCovariance(gtsam.symbol("a", t))
+            assert found[t] == pytest.approx(expected, rel=1e-3, abs=1e-6)
     mean = (one + bound(told.of_runs(slice(1, 2)))) / 2
     assert bound(told) == pytest.approx(mean, rel=1e-12)
     assert bound_rt_le(mean) > 1.1 * bound_rt_le(bound(clean))

@@ -4,7 +4,7 @@ One recursion over the steps of a drive with members that come and go serves all
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -402,26 +402,22 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
 
 
 def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Floats]]:
-    """Steps and the bound (dn, dn) of their members: forward, or for smoothing from the last step to the first.
-
-    Smoothing is the two-filter form: information from the past with the present, plus that of the future.
-    """
+    """Steps and the bound (dn, dn) of their members: forward, or for smoothing from the last step to the first, by the
+    recursion of Rauch, Tung and Striebel."""
     filtered: list[Floats] = []
     cov: Floats = np.zeros((0, 0))
     bar = progress_bar(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0)
     with bar, one_thread():
         for t, stage in enumerate(stages):
-            information = _onward(cov, stage) + stage.gained
-            cov = np.linalg.inv(information)
+            cov = np.linalg.inv(_onward(cov, stage) + stage.gained)
             bar.update()
             if smoothing:
-                filtered.append(information)
+                filtered.append(cov)
             else:
                 yield t, cov
-        future: Floats = np.zeros_like(cov)
         for t in range(len(filtered) - 1, -1, -1):
-            yield t, np.linalg.inv(filtered.pop() + future)
-            future = _backward(future, stages[t], len(stages[t - 1].members)) if t else future
+            yield t, cov
+            cov = _smoothed(filtered[t - 1], stages[t], cov) if t else cov
             bar.update()
 
 
@@ -438,25 +434,25 @@ def require_white(sensors: Sensors, what: str) -> None:
         raise InputError("gnss_drift_std, gnss_common_std", lasting_stds, f"must be 0 for {what}", hint)
 
 
+def _moved(cov: Floats, stage: Stage) -> tuple[Ints, Ints, Floats, Floats]:
+    """Of the members that stay: places of their numbers one step before and now, F, and F P F^T + Q."""
+    stays, none = np.flatnonzero(stage.previous >= 0), np.zeros((0, 0))
+    d = stage.motion.shape[-1]
+    before, now = (np.add.outer(d * of, np.arange(d)).ravel() for of in (stage.previous[stays], stays))
+    motion, process = (block_diag(*of[stays], none) for of in (stage.motion, stage.process))
+    return before, now, motion, motion @ cov[np.ix_(before, before)] @ motion.T + process
+
+
 def _onward(cov: Floats, stage: Stage) -> Floats:
     """Information about the members of a step from the covariance one step before, (F P F^T + Q)^-1."""
-    d = stage.motion.shape[-1]
-    stays, out = np.flatnonzero(stage.previous >= 0), np.diag(stage.prior.ravel())
-    if len(stays):
-        here, there = (np.add.outer(d * of, np.arange(d)).ravel() for of in (stays, stage.previous[stays]))
-        motion = block_diag(*stage.motion[stays])
-        moved = motion @ cov[np.ix_(there, there)] @ motion.T + block_diag(*stage.process[stays])
-        out[np.ix_(here, here)] = np.linalg.inv(moved)
+    _, now, _, moved = _moved(cov, stage)
+    out = np.diag(stage.prior.ravel())
+    out[np.ix_(now, now)] = np.linalg.inv(moved)
     return out
 
 
-def _backward(future: Floats, stage: Stage, n: int) -> Floats:
-    """Information of a step and its future about the n members one step before, whose motion is the inverse one."""
-    d, back = stage.motion.shape[-1], np.linalg.inv(stage.motion)
-    stays, previous = np.flatnonzero(stage.previous >= 0), np.full(n, -1)
-    previous[stage.previous[stays]] = stays
-    motion, process = np.zeros((2, n, d, d))
-    motion[stage.previous[stays]] = back[stays]
-    process[stage.previous[stays]] = (back @ stage.process @ back.swapaxes(1, 2))[stays]
-    reverse = replace(stage, previous=previous, motion=motion, process=process, prior=np.zeros((n, d)))
-    return _onward(np.linalg.inv(future + stage.gained), reverse)
+def _smoothed(cov: Floats, stage: Stage, later: Floats) -> Floats:
+    """The covariance one step before that of `later`, with all that is known there."""
+    before, now, motion, moved = _moved(cov, stage)
+    gain = cov[:, before] @ motion.T @ np.linalg.inv(moved)
+    return np.asarray(cov + gain @ (later[np.ix_(now, now)] - moved) @ gain.T)
