@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import AnyArray, Floats, Ints, checked, frozen, plain
+from ...arrays import AnyArray, Floats, Ints, checked, frozen, number, plain
 from ...errors import InputError, shown
 from ..assess.assess import squared
 from ..model.factor import Factor, reweighed
@@ -92,8 +92,13 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
 
 
 def bounds(marked: Marked, threshold: float) -> Floats:
-    """(G,) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
+    """(G,) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds; InputError for a
+    threshold that is no probability in (0, 1)."""
     from scipy.special import gammaincinv
+
+    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
+        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
+        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
 
     freedom = marked.collected(lambda factor: factor.measured)
     return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))

@@ -14,13 +14,12 @@ from ..assess.assess import INLIER_WEIGHT, expected, implausible, rejection
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend
 from ..descent.levenberg_marquardt import Arrival, arrive
 from ..graph_problems import started
-from ..model.factor import Loss
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
 from ..starts.initial import initial_guess
 from .candidates import Candidates, bounds, mark
-from .graduated import Graduation, contest, graduate, surrogate_of
+from .graduated import LAST_MU, Graduation, contest, graduate
 from .loop_closures import known_start
 
 Start = Literal["any", "known"]
@@ -29,7 +28,6 @@ Start = Literal["any", "known"]
 def solve_gnc(
     problem: Problem,
     candidates: Candidates,
-    loss: str = "truncated",
     threshold: float = 0.99,
     groups: npt.ArrayLike | None = None,
     backend: str | Backend = "gauss-newton",
@@ -39,14 +37,13 @@ def solve_gnc(
 ) -> Solution:
     """A minimum of 1/2 sum |r_inlier|^2 + 1/2 sum_g rho(r_g^2), r_g^2 = sum over the group of |W (h(x) - z)|^2.
 
-    rho is min(r^2, c^2) ("truncated") or r^2 / (1 + r^2/c^2) ("geman-mcclure"), c^2 the chi-square quantile at as many
-    degrees of freedom as the group has numbers. Starting from a nearly convex surrogate rho_mu, weighted least squares
-    and the weights w = d rho_mu / d r^2 alternate while mu turns rho_mu into rho:
+    rho is min(r^2, c^2), c^2 the chi-square quantile at as many degrees of freedom as the group has numbers. Starting
+    from a nearly convex surrogate rho_mu, weighted least squares and the weights w = d rho_mu / d r^2 alternate while
+    mu turns rho_mu into rho,
 
-        truncated: w = sqrt(mu (mu + 1)) c/|r| - mu within [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round
-        geman-mcclure: w = (mu c^2 / (r^2 + mu c^2))^2, mu from 2 r_max^2 / c^2 down to 1
+        w = sqrt(mu (mu + 1)) c/|r| - mu within [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round,
 
-    until the weights no longer change, truncated ones at 0 or 1. Inlier groups must agree better than the others: a
+    until the weights no longer change, at 0 or 1. Inlier groups must agree better than the others: a
     majority of consistent outliers wins, and so does an error that all share.
 
     Where known inliers hold every node, as odometry does, they are the start, which candidates join where they are
@@ -58,7 +55,6 @@ def solve_gnc(
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
         candidates: factors by index, or (factor, rows); M measurements in all.
-        loss: "truncated" or "geman-mcclure".
         threshold: probability that the residual of an inlier group is within c.
         groups: (M,) labels; measurements with one label share one weight, such as the fixes of one neighbour. Default:
             each on its own.
@@ -75,12 +71,12 @@ def solve_gnc(
 
     Raises:
         InputError: candidates that do not exist, appear twice or have a loss, other groups than measurements, a
-            threshold outside (0, 1), an unknown loss or start, known inliers that leave nodes free which the candidates
+            threshold outside (0, 1), an unknown start, known inliers that leave nodes free which the candidates
             do not place where the start is theirs, and what `solve` refuses.
         SolveError: (if `throw`) as `solve`, or weights that did not settle.
 
     References:
-        Yang, Antonante, Tzoumas, Carlone, RA-L 2020, equations 12 and 14, remark 5.
+        Yang, Antonante, Tzoumas, Carlone, RA-L 2020, equation 14, remark 5.
 
     >>> problem = Problem(("a",)).add("position", ["a"] * 3, [[0, 0, 0], [1, 0, 0], [50, 0, 0]], std=1.0)
     >>> solution = solve_gnc(problem, candidates=[0])
@@ -90,8 +86,8 @@ def solve_gnc(
     'another minimum, elsewhere, costs as much'
     """
     problem = started(instance("problem", problem, Problem))
-    marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, Start)
+    marked = mark(problem, candidates, groups)
     marked = replace(marked, bound=bounds(marked, threshold))
     each, extras, began, doubts = list[int](), dict[str, Any](), clock(), tuple[str, ...]()
 
@@ -105,7 +101,7 @@ def solve_gnc(
         return end.x
 
     def finish(at: Floats, weight: Floats | None = None) -> Graduation:
-        return graduate(marked, surrogate, inner, at, surrogate.last, weight)
+        return graduate(marked, inner, at, LAST_MU, weight)
 
     def explained(end: Graduation) -> bool:  # the minimum of ranges and angles need not be the only one
         part = marked.reweigh(end.weight, end.x)
@@ -114,7 +110,7 @@ def solve_gnc(
 
     def cost(at: Floats) -> float:
         s = marked.squares(at) / marked.bound
-        return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ Loss(loss, 1.0).cost(s))
+        return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ np.minimum(s, 1.0))
 
     try:
         from_known = known_start(marked, inner)
@@ -127,9 +123,7 @@ def solve_gnc(
         before, end = from_known.rounds, finish(from_known.x, from_known.weight)
         extras |= {"joined": from_known.joined} if from_known.joined else {}
     if end is None or (start == "any" and not explained(end)):
-        best, x, graduation, doubts = contest(
-            marked, surrogate, inner, initial_guess(problem), lambda at: finish(at).x, cost
-        )
+        best, x, graduation, doubts = contest(marked, inner, initial_guess(problem), lambda at: finish(at).x, cost)
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
     final = solve(marked.reweigh(end.weight, end.x), backend, throw=throw and end.settled, **options)

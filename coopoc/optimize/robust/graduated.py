@@ -1,14 +1,13 @@
 """The graduated loop: weighted least squares and weights alternate while a nearly convex surrogate becomes the loss."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, Ints, frozen, number, one_of
-from ...errors import InputError
+from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
@@ -22,10 +21,8 @@ MAX_ROUNDS = 300
 """About 20 are needed."""
 MU_RATE = 1.4
 """By which mu changes from round to round."""
-SETTLED_CHANGE = 1e-6
-"""Largest change of a weight that is none."""
-EASY = 1e-6
-"""Below this mu is not inverted: all candidates are far within their thresholds."""
+EASY, LAST_MU = 1e-6, 1e6
+"""Below the first mu is not inverted: all candidates are far within their thresholds; mu of a last graduation."""
 REGRADUATE_RATIO2 = 17.0
 """Squared ratio of a residual to its threshold from which the end graduates once more: it may then give up other
 measurements, as good as those that it rejects."""
@@ -36,51 +33,15 @@ GAINED = 1e-3
 """Share of the cost that another round must save."""
 
 
-@dataclass(frozen=True)
-class Surrogate:
-    """A robust loss made convex by mu, as weights of the ratio s = r^2 / c^2.
-
-    Args:
-        first: mu from the largest ratio.
-        weight: w(s, mu) = d rho_mu / d r^2.
-        later: the next mu.
-        done: whether the weights (G,) have settled, from the new ones, those before and mu.
-        last: mu at which rho_mu is rho, or near enough.
-    """
-
-    first: Callable[[float], float]
-    weight: Callable[[Floats, float], Floats]
-    later: Callable[[float], float]
-    done: Callable[[Floats, Floats, float], bool]
-    last: float
+def first_mu(worst: float) -> float:
+    """mu at which the surrogate is convex for ratios s = r^2 / c^2 up to the worst (Yang et al.); it grows from there
+    until the surrogate is min(r^2, c^2), or near enough, at LAST_MU."""
+    return 1.0 / max(2.0 * worst - 1.0, EASY)
 
 
-SURROGATES = {
-    "truncated": Surrogate(
-        lambda worst: 1.0 / max(2.0 * worst - 1.0, EASY),
-        lambda s, mu: np.clip(np.sqrt(mu * (mu + 1.0) / np.maximum(s, 1e-30)) - mu, 0.0, 1.0),
-        lambda mu: mu * MU_RATE,
-        lambda new, old, mu: bool(((new == old) & ((new == 0.0) | (new == 1.0))).all()),
-        1e6,
-    ),
-    "geman-mcclure": Surrogate(
-        lambda worst: max(2.0 * worst, 1.0),
-        lambda s, mu: np.square(mu / (s + mu)),
-        lambda mu: max(mu / MU_RATE, 1.0),
-        lambda new, old, mu: mu == 1.0 and bool((np.abs(new - old) <= SETTLED_CHANGE).all()),
-        1.0,
-    ),
-}
-"""Of Yang et al.: min(r^2, c^2) as mu grows from c^2 / (2 r_max^2 - c^2), r^2 / (1 + r^2/c^2) as it falls to 1."""
-
-
-def surrogate_of(loss: str, threshold: float) -> Surrogate:
-    """The surrogate of a loss; InputError if there is none, or if the threshold is no probability in (0, 1)."""
-    one_of("loss", loss, SURROGATES)
-    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
-        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
-        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
-    return SURROGATES[loss]
+def weights(s: Floats, mu: float) -> Floats:
+    """w(s) = d rho_mu / d r^2 of the surrogate of min(r^2, c^2)."""
+    return np.clip(np.sqrt(mu * (mu + 1.0) / np.maximum(s, 1e-30)) - mu, 0.0, 1.0)
 
 
 class Graduation(NamedTuple):
@@ -95,27 +56,24 @@ class Graduation(NamedTuple):
 
 def graduate(
     marked: Marked,
-    surrogate: Surrogate,
     inner: Inner,
     x: Floats,
     mu: float,
     weight: Floats | None = None,
 ) -> Graduation:
     """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), mu and weight (G,),
-    default ones."""
+    default ones, until all are 0 or 1."""
     weight = np.ones(len(marked.bound)) if weight is None else weight
     for rounds in range(MAX_ROUNDS):
-        new = surrogate.weight(marked.squares(x) / marked.bound, mu)
-        settled, weight = surrogate.done(new, weight, mu), new
-        if settled:
+        before, weight = weight, weights(marked.squares(x) / marked.bound, mu)
+        if ((weight == before) & ((weight == 0.0) | (weight == 1.0))).all():
             return Graduation(x, weight, rounds, mu, True)
-        x, mu = inner(marked.reweigh(weight, x)), surrogate.later(mu)
+        x, mu = inner(marked.reweigh(weight, x)), mu * MU_RATE
     return Graduation(x, weight, MAX_ROUNDS, mu, False)
 
 
 def contest(
     marked: Marked,
-    surrogate: Surrogate,
     inner: Inner,
     start: Floats,
     finish: Descend,
@@ -129,15 +87,13 @@ def contest(
 
     Args:
         marked: the problem and its candidates.
-        surrogate: of their loss.
         inner: solves a problem from its x0.
         start: (n, ambient).
         finish: from where a start leads to a minimum of the cost.
         cost: that is to be least.
     """
     x = inner(marked.problem.replace_unchecked(x0=frozen(start)))
-    mu = surrogate.first(float((marked.squares(x) / marked.bound).max()))
-    graduation = graduate(marked, surrogate, inner, x, mu)
+    graduation = graduate(marked, inner, x, first_mu(float((marked.squares(x) / marked.bound).max())))
     huber, cauchy, truncated = (softened(marked, name) for name in ("huber", "cauchy", "truncated"))
 
     with progress("robust") as counted:
@@ -169,7 +125,7 @@ def contest(
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)
             if len(loose):
-                again = graduate(marked, surrogate, inner, best_x, surrogate.first(REGRADUATE_RATIO2))
+                again = graduate(marked, inner, best_x, first_mu(REGRADUATE_RATIO2))
                 best_x = min((best_x, landed(again.x)), key=cost)
             best_x, moves, *_ = across(
                 truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
@@ -231,10 +187,8 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
         steps += end.iterations
         return end.x
 
-    surrogate = SURROGATES.get(next(iter(robust.values())).name, SURROGATES["truncated"])
     best, x, _, notes = contest(
         marked,
-        surrogate,
         inner,
         start,
         lambda at: inner(problem.replace_unchecked(x0=frozen(at))),
