@@ -9,10 +9,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
+from coopoc import InputError
 from coopoc.arrays import listed, number
 from coopoc.paths import given_path, made_folder
 from coopoc.plugins import in_file
@@ -22,12 +21,17 @@ from coopoc.world.sensors import VelocityReading
 from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federate import federate
 from .nets.gain import Gain
+from .nets.okf import NoiseParameters
+from .nets.stack import flatten
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
-from .training.fit import fit
+from .training.fit import Judge, fit
 from .training.machine import LINE
 from .training.okf_fit import fit_okf
+
+LEAST_STD = 1e-6
+"""m, of noise that is fitted, and share of a velocity."""
 
 
 def train_all(
@@ -118,25 +122,17 @@ def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
 
 
 def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
-    """RT-LE on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
+    """Rms error on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
     data = _own(job, job_clients(job, fleet))
-    noise_model = NoiseModel.fitted(*_drives(_joined(data, "training")))
-    recording, truth = _drives(_joined(data, "validation"))
-    methods = model.method(job.name), Kalman(noise_model)
-    ours, theirs = (np.nansum((method(recording, recording.ids).x[0] - truth.position) ** 2) for method in methods)
-    return float(np.sqrt(ours / theirs))
-
-
-def _drives(segments: Segments) -> tuple[Recording, Fleet]:
-    """Pieces, as they were drawn once, as vehicles that drive at one time; where no piece has a true height it is 0."""
-    gnss, velocity, truth = (
-        part.double().numpy().swapaxes(0, 1) for part in (segments.gnss, segments.velocity, segments.truth)
+    training, validation = (_joined(data, part) for part in ("training", "validation"))
+    motions = training.truth.diff(dim=1) - training.dt * training.velocity[:, 1:]
+    process, gnss = (
+        off.square().nanmean((0, 1)).sqrt().nan_to_num(1.0).clip(LEAST_STD)
+        for off in (motions, training.gnss - training.truth)
     )
-    truth = np.where(np.isnan(truth).all(axis=(0, 1)), 0.0, truth)
-    names = tuple(map(str, range(gnss.shape[1])))
-    fleet = Fleet(names, segments.dt * np.arange(len(gnss)), truth, 0 * truth)
-    recording = observe(fleet, Sensors(), V2X(max_neighbours=0))
-    return replace(recording, gnss=gnss[None], velocity=velocity[None]), fleet
+    fitted = NoiseParameters().with_logs(torch.stack([process, torch.full((3,), LEAST_STD), gnss]).log())
+    ours, theirs = (float(Judge([[validation]], net)(flatten([net]))) for net in (model, fitted))
+    return math.sqrt(ours / theirs)
 
 
 def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
