@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import check_turns, checked
-from ..errors import InputError
+from ..arrays import check_turns, checked, refuse
 from ..paths import given_path, write
-from .values import to_orientation, to_rotation
 
 
 def write_tum(
@@ -35,17 +33,11 @@ def write_tum(
     where = checked("position", position, "(T, 3)", (-1, 3))
     stamps = checked("t", t, "(T,)", (len(where),))
     course = np.zeros(len(where)) if heading is None else checked("heading", heading, "(T,)", (len(where),))
-    poses = np.column_stack([stamps, where, course])
-    bad = np.flatnonzero(~np.isfinite(poses).all(axis=1))
-    if len(bad):
-        raise InputError(f"pose {bad[0]}", poses[bad[0]], "must be finite numbers", "Remove the pose.")
-    late = 1 + np.flatnonzero(np.diff(stamps) <= 0)
-    if len(late):
-        order = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
-        hint = "Sort the poses by time, and remove one that repeats."
-        raise InputError(f"pose {late[0]}, column t", order, "must increase", hint)
+    for name, values in (("t", stamps), ("position", where), ("heading", course)):
+        refuse(name, values, ~np.isfinite(values), "must be finite", "Remove the pose.")
+    late, hint = np.append(False, np.diff(stamps) <= 0), "Sort the poses by time, and remove one that repeats."
+    refuse("t", stamps, late, "must increase", hint)
     check_turns("heading", course)
-    rotation = np.tile(np.eye(3), (len(where), 1, 1))
-    rotation[:, :2, :2] = to_rotation(course[:, None])
-    rows = np.column_stack([stamps, where, to_orientation(rotation)])
+    half, none = 0.5 * course, 0.0 * course
+    rows = np.column_stack([stamps, where, none, none, np.sin(half), np.cos(half)])
     write(given_path(path), lambda file: np.savetxt(file, rows, fmt="%.9f"))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import AnyArray, Floats, Ints, checked, frozen, number, plain
+from ...arrays import TINY, AnyArray, Floats, Ints, checked, frozen, number, plain
 from ...errors import InputError, shown
 from ..assess.assess import squared
 from ..model.factor import Factor, reweighed
@@ -96,9 +96,10 @@ def bounds(marked: Marked, threshold: float) -> Floats:
     threshold that is no probability in (0, 1)."""
     from scipy.special import gammaincinv
 
-    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
-        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
-        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
+    hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
+    threshold = number(
+        "threshold", threshold, TINY, np.nextafter(1.0, 0.0), allowed="a probability in (0, 1)", hint=hint
+    )
 
     freedom = marked.collected(lambda factor: factor.measured)
     return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
