@@ -8,7 +8,7 @@ from .motion import MotionNoise, keep_pace, process_variance
 from .odometry_fault import correct, judge
 
 ROUNDING = 1e-9
-"""s, rounding error of a sum of time steps."""
+"""s, rounding error of a sum of time steps; no step is shorter."""
 ESTIMATE, NO_FIX_YET, BAD_INPUT = 0, 1, 2
 """What a step of a stream returns."""
 VELOCITY, DT, FIX_AGE = slice(3, 6), 6, 7
@@ -87,7 +87,7 @@ def dead_reckon(
         missing += math.isnan(row[c])
         if math.isinf(row[c]) or not math.isfinite(row[3 + c]):
             return BAD_INPUT
-    if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
+    if not (dt > ROUNDING and math.isfinite(dt)) or missing % 3 != 0:
         return BAD_INPUT
     if missing == 0 and not -ROUNDING <= age <= min(history[0, 2] + dt, history[0, 3]) + ROUNDING:
         return BAD_INPUT

@@ -1,7 +1,5 @@
 """Inputs of streams: checks of a step, and the newest motions of a vehicle, which bring a late fix forward."""
 
-import sys
-
 import numpy as np
 import numpy.typing as npt
 
@@ -52,9 +50,9 @@ class MotionHistory:
         number(
             "dt",
             dt,
-            sys.float_info.min,
+            ROUNDING,
             MAX_POSITION,
-            allowed="finite and > 0",
+            allowed="finite and > 1 ns",
             hint="Give the seconds since the last step.",
         )
         three("velocity", velocity, MAX_SPEED)

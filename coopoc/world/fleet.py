@@ -148,7 +148,7 @@ def _check_gaps(fleet: Fleet) -> None:
 
 def same_drive(noun: Any, ids: Sequence[str], t: Floats) -> None:
     """InputError unless a Fleet or Recording has these vehicles in this order, and its steps are at times t (T,) s."""
-    if tuple(ids) != noun.ids or len(t) != len(noun.t) or np.abs(t - noun.t).max() > 0.01 * noun.dt:
+    if tuple(ids) != noun.ids or len(t) != len(noun.t) or not np.allclose(t, noun.t, 0, 0.01 * noun.dt):
         kind = type(noun).__name__.lower()
         hint = f"Give the {kind} that was observed, its vehicles in the same order."
         raise InputError(kind, repr(noun), "ids and times differ from those that were recorded", hint)

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import TINY, Bools, Floats, Ints, checked, instance, listed, plain, refuse, remade, texts
+from ..arrays import TINY, Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
 from .fleet import check_steps, clock, columns, interval, names
@@ -238,10 +238,11 @@ class Recording:
         ((0, 3),)
         """
         (col,) = columns("vehicle", [vehicle], self.ids)
+        least = number("shortest", shortest, kind=int)
         there = np.isfinite(self.velocity[0, :, col, 0])
         known: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
         firsts = [(a + int(np.argmax(known[a:b])), b) for a, b in stretches(there) if known[a:b].any()]
-        return tuple((a, b) for a, b in firsts if b - a >= shortest)
+        return tuple((a, b) for a, b in firsts if b - a >= least)
 
     @cached_property
     def usable_relative(self) -> Floats:

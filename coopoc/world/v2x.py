@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import AnyArray, check_fields
+from ..arrays import AnyArray, check_fields, checked, number
 
 Schedule = Literal["nearest", "round robin"]
 
@@ -102,7 +102,7 @@ class Message:
 
     >>> Message("fix and velocity", 8).payload
     32
-    >>> Message("estimate", 9, rounds=3).size(overhead=100)
+    >>> print(Message("estimate", 9, rounds=3).size(overhead=100))
     408
     """
 
@@ -126,7 +126,8 @@ class Message:
             overhead: bytes per message on air.
             neighbours: of the sender, a number or an array.
         """
-        return self.rounds * (self.payload + 4 * self.per_neighbour * neighbours + overhead)
+        overhead, counts = number("overhead", overhead, kind=int), checked("neighbours", neighbours, dtype=int)
+        return self.rounds * (self.payload + 4 * self.per_neighbour * counts + overhead)
 
 
 NO_MESSAGE = Message("none", 0, rounds=0)
