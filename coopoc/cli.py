@@ -171,9 +171,9 @@ def _status(argv: list[str]) -> int:
         print(end="", flush=True)  # whether there is a stdout or not
         return status
     except ModuleNotFoundError as error:
-        if (known := missing(error, " ".join(["coopoc", *argv[:1]]))) is error:
+        if (problem := missing(error, " ".join(["coopoc", *argv[:1]]))) is error:
             raise
-        print(f"coopoc: {known}", file=sys.stderr)
+        print(f"coopoc: {problem}", file=sys.stderr)
         return 2
     except (InputError, MissingLibraryError) as error:
         print(f"coopoc: {error}", file=sys.stderr)

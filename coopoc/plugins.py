@@ -175,9 +175,9 @@ def called(group: str, name: str, hint: str, *arguments: Any) -> Any:
     >>> called("coopoc.channels", "bsm", "Give the number of neighbours.", 4).rate
     10.0
     """
-    found = find(group, name)
+    plugin = find(group, name)
     try:
-        return found(*arguments)
+        return plugin(*arguments)
     except InputError:
         raise
     except Exception as error:  # of code that is not ours

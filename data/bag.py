@@ -204,8 +204,10 @@ def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> p
     for name, kind in UNMEASURED.items():
         if name in topic and kind in made:
             made[kind] = made[kind].where(topic[name] >= 0)
-    known = topic.get("position_covariance_type", 1) != 0  # 0: the covariance is unknown
-    deviations = {name: np.sqrt(each.where(known & (each > 0))) for name, each in made.items() if name.endswith("_std")}
+    known_cov = topic.get("position_covariance_type", 1) != 0  # 0: the covariance is unknown
+    deviations = {
+        name: np.sqrt(each.where(known_cov & (each > 0))) for name, each in made.items() if name.endswith("_std")
+    }
     return pd.DataFrame(made | deviations)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 TABLES = (".csv", ".parquet")
 WHOLE = re.compile(r"^(\d+)\.0$")
 """What a spreadsheet or pandas makes of a whole number beside empty cells: 7.0 is the name 7."""
-COLUMNS = 5000
+MAX_COLUMNS = 5000
 """Most columns of a table."""
 USUAL_HEADERS = {
     "vehicle": "vehicle observer robot car agent sender vehicle_id robot_id id name",
@@ -148,17 +148,17 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, dtype=float)  # in ns years end at 2262
 
 
-def factors(given: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
+def factors(mapping: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
     """Numbers by name; InputError for a name that is none of `names`, for 0, and for a deviation or a scale of times
     that is not positive."""
-    for name, value in named(field, given or {}, f"Give {field}={{name: number}}.").items():
+    for name, value in named(field, mapping or {}, f"Give {field}={{name: number}}.").items():
         if name not in names:
             raise unknown(field, name, names)
         least = 1e-12 if field == "std" or name == "t" else -MAX_NUMBER
         allowed = f"a finite number other than 0{', and > 0' * (least > 0)}"
         if not number(f"{field} of {name}", value, least, MAX_NUMBER, allowed=allowed):
             raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
-    return dict(given or {})
+    return dict(mapping or {})
 
 
 def words(frame: "pd.DataFrame", column: str, file: str) -> list[str]:
@@ -216,8 +216,8 @@ def usual_key(header: str) -> str:
     >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "rank", "UTM_North")]
     ['t', 'latitude', 'compass_deg', '', 'y']
     """
-    found = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
-    parts = {header.lower(), *(word.lower() for word in found)}
+    pieces = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
+    parts = {header.lower(), *(word.lower() for word in pieces)}
     return next((key for key, usual in USUAL_HEADERS.items() if not parts.isdisjoint(usual.split())), "")
 
 
@@ -273,9 +273,9 @@ def _first_lines(path: Path) -> tuple[str, list[str], list[str]]:
 def _check_header(path: Path, header: Sequence[str]) -> None:
     if len(header) < 2:
         raise _no_table(path, repr("".join(header))[:80])
-    if len(header) > COLUMNS:
+    if len(header) > MAX_COLUMNS:
         raise InputError(
-            path.name, f"{len(header)} columns", f"must be at most {COLUMNS}", "Write one row per instant."
+            path.name, f"{len(header)} columns", f"must be at most {MAX_COLUMNS}", "Write one row per instant."
         )
     name, count = Counter(name.strip() for name in header).most_common(1)[0]
     if count > 1:

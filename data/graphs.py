@@ -48,8 +48,8 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
                 "Cut the file at the gap.",
             )
         used += len(index)
-        for place in places:
-            names[place] = robot
+        for pose in places:
+            names[pose] = robot
         turn, stamps = wrap(edges.orientation[index, 0]), graph.stamps[places]
         moved, lasts = turned(np.pad(edges.position[index], ((0, 0), (0, 1))), -0.5 * turn)[:, 0], np.diff(stamps)
         t = np.arange(stamps[0] + SAMPLE, stamps[-1], SAMPLE)  # steps half of it before are there, and have a truth

@@ -12,7 +12,7 @@ from coopoc.arrays import Floats, number
 from coopoc.evaluate.metrics import pose_covariance
 from coopoc.world.sensors import ANGULAR
 
-LEARNED = "velocity_std_ratio velocity_floor yaw_rate_std range_std azimuth_std speed_scale_std yaw_rate_bias_std"
+LEARNABLE = "velocity_std_ratio velocity_floor yaw_rate_std range_std azimuth_std speed_scale_std yaw_rate_bias_std"
 """Numbers of Sensors that are learned where they are positive."""
 MAX_STDS = {"velocity_std_ratio": 1.0, "speed_scale_std": 1.0, **dict.fromkeys(ANGULAR, np.pi)}
 """What Sensors allow: above it a measurement means nothing, and the score is flat."""
@@ -33,7 +33,7 @@ class PoseTask(NamedTuple):
 def averaged(several: Sequence[Sensors]) -> tuple[Sensors, Floats]:
     """The first of some with the mean logarithms of what all have learned, and these logarithms (N, numbers): a
     federation of one round."""
-    names = [name for name in LEARNED.split() if getattr(several[0], name) > 0]
+    names = [name for name in LEARNABLE.split() if getattr(several[0], name) > 0]
     logs = np.log([[getattr(one, name) for name in names] for one in several])
     return replace(several[0], **dict(zip(names, np.exp(logs.mean(axis=0)).tolist(), strict=True))), logs
 
@@ -68,7 +68,7 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
     if not tasks:
         raise InputError("tasks", 0, "must be one or more", "Give drives with their truth.")
     evaluations = number("evaluations", evaluations, 1, kind=int, allowed=">= 1", hint="150 are some minutes.")
-    names = [name for name in LEARNED.split() if getattr(start, name) > 0]
+    names = [name for name in LEARNABLE.split() if getattr(start, name) > 0]
     first = np.log([getattr(start, name) for name in names])
 
     def sensors(x: Floats) -> Sensors:

@@ -13,7 +13,7 @@ from coopoc.study.study import Row
 from coopoc.world.recording import NOTHING_SIMULATED
 
 from .pose_drives import BLOCK_SECONDS, MIN_BLOCKS, hashed
-from .roads import ROADS, seen
+from .roads import ROADS, thinned
 from .tasks import blocks_of, costs, located, planar, rounded
 
 CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
@@ -40,7 +40,7 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     Raises:
         InputError: a file that is missing.
     """
-    recording, truth = seen(CONVOYS[task], data)
+    recording, truth = thinned(CONVOYS[task], data)
     column, dt = recording.observers[0], recording.dt
     starts, length = _pieces(recording, column)
     there = np.isfinite(truth.position[:, column, 0])

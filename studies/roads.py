@@ -48,7 +48,7 @@ def holds(path: Path, task: str) -> bool:
 
 
 @lru_cache(maxsize=2)
-def seen(task: str, data: Path | None) -> tuple[Recording, Fleet]:
+def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     """Measurements with thinned fixes, and the truth.
 
     Raises:
@@ -100,7 +100,7 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
         data: folder of the data, None for those that were fetched, or a log.
         made: a method.
     """
-    recording, truth = seen(task, data)
+    recording, truth = thinned(task, data)
     start, column = int(CALIBRATION_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles

@@ -171,7 +171,7 @@ def located(folder: Path | None, name: str) -> Path:
 
 
 @lru_cache(maxsize=2)
-def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
+def observed_task(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
     if task.startswith("robots"):
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
@@ -203,7 +203,7 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     """
     file, block_s = LOGGED[task]
     path = located(folder, file)
-    recording, fleet, start, assumed = seen(task, path)
+    recording, fleet, start, assumed = observed_task(task, path)
     if isinstance(made, str):
         made = PoseFilter(**{"lasting": task != "uwb", **assumed, **POSES[made]}, gate=GATE_STDS)
     elif is_dataclass(made):

@@ -195,7 +195,7 @@ def _long(scene: Scene, rng: Draws, stated: bool) -> Made:
 
 def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Made:
     left = np.where(np.isin(range(3), columns), 1.0, np.nan)
-    return scene.edited(lambda seen: replace(seen, relative=left * seen.relative)), "in the whole drive"
+    return scene.edited(lambda noisy: replace(noisy, relative=left * noisy.relative)), "in the whole drive"
 
 
 def _late(scene: Scene, rng: Draws) -> Made:

@@ -180,25 +180,25 @@ def _frame(rows: Sequence[Row]) -> "pd.DataFrame":
     return frame
 
 
-def summary(found: "pd.DataFrame") -> dict[str, Any]:
+def summary(scored: "pd.DataFrame") -> dict[str, Any]:
     """Shares and means over worlds with 95 % bootstrap intervals, percentile, NEES and time.
 
     Args:
-        found: worlds and their ratios.
+        scored: worlds and their ratios.
     """
-    sound, worse = found[np.isfinite(found["over_better"])], found["over_better"] > WORSE_RATIO
-    made: dict[str, Any] = {"worlds": len(found), "failed": len(found) - len(sound)}
-    made["worse_than_alone"] = _interval(100.0 * (found["over_alone"] > WORSE_RATIO))
+    sound, worse = scored[np.isfinite(scored["over_better"])], scored["over_better"] > WORSE_RATIO
+    made: dict[str, Any] = {"worlds": len(scored), "failed": len(scored) - len(sound)}
+    made["worse_than_alone"] = _interval(100.0 * (scored["over_alone"] > WORSE_RATIO))
     made["worse_than_better"] = _interval(100.0 * worse)
-    made["worse_unnoted"] = _interval(100.0 * (worse & (found["noted"] == 0.0)))
+    made["worse_unnoted"] = _interval(100.0 * (worse & (scored["noted"] == 0.0)))
     if len(sound):
         for key in ("over_joint", "over_better"):
             made[key] = [_short(float(np.exp(value))) for value in _interval(np.log(sound[key].clip(MIN_RATIO)))]
-    made["percentile_95"] = _short(float(np.quantile(found["over_better"], 0.95, method="higher")))
-    if len(inside := found["nees_inside"].dropna()):
-        made |= {"nees_inside": _interval(inside), "nees_median": _short(float(found["nees_median"].median()))}
+    made["percentile_95"] = _short(float(np.quantile(scored["over_better"], 0.95, method="higher")))
+    if len(inside := scored["nees_inside"].dropna()):
+        made |= {"nees_inside": _interval(inside), "nees_median": _short(float(scored["nees_median"].median()))}
     if len(sound):
-        made["microseconds_per_step"] = _short(float(found["microseconds_per_step"].median()))
+        made["microseconds_per_step"] = _short(float(scored["microseconds_per_step"].median()))
     return made
 
 
@@ -208,7 +208,7 @@ def _interval(values: "pd.Series[float]") -> list[float]:
     return [_short(end) for end in (level.mean, level.low, level.high) if np.isfinite(end)]
 
 
-def _worst(name: str, split: Split, found: "pd.DataFrame") -> list[Row]:
+def _worst(name: str, split: Split, scored: "pd.DataFrame") -> list[Row]:
     """Worlds with the largest ratios, what is in them, and the command that runs each again."""
     more = " --validation" * (split == "validation")
     return [
@@ -218,7 +218,7 @@ def _worst(name: str, split: Split, found: "pd.DataFrame") -> list[Row]:
             "text": world(one["seed"], split).text,
             "command": f"coopoc benchmark {name} --worlds 1 --seed {one['seed']}{more}",
         }
-        for one in found.sort_values("over_better", ascending=False, kind="stable").head(10).to_dict("records")
+        for one in scored.sort_values("over_better", ascending=False, kind="stable").head(10).to_dict("records")
     ]
 
 
@@ -253,18 +253,18 @@ def _of(value: float | None) -> str:
 def _table(head: str, summaries: Sequence[tuple[str, Params]], left_out: str) -> str:
     """Markdown table of summaries by name, but for one of its columns."""
     rows = list[Row]()
-    for name, found in summaries:
+    for name, scored in summaries:
         columns = {
             head: name,
-            "worlds": f"{found['worlds']}" + f" ({found['failed']} failed)" * (found["failed"] > 0),
-            "worse than alone [%]": _level(found["worse_than_alone"]),
-            "worse than the better [%]": _level(found["worse_than_better"]),
-            "without a note [%]": _level(found["worse_unnoted"]),
-            "over joint": _level(found.get("over_joint")),
-            "over the better": _level(found.get("over_better")),
-            "95th percentile": _of(found["percentile_95"]),
-            "NEES inside": _level(found.get("nees_inside")),
-            "median NEES": _of(found["nees_median"]) if "nees_median" in found else "",
+            "worlds": f"{scored['worlds']}" + f" ({scored['failed']} failed)" * (scored["failed"] > 0),
+            "worse than alone [%]": _level(scored["worse_than_alone"]),
+            "worse than the better [%]": _level(scored["worse_than_better"]),
+            "without a note [%]": _level(scored["worse_unnoted"]),
+            "over joint": _level(scored.get("over_joint")),
+            "over the better": _level(scored.get("over_better")),
+            "95th percentile": _of(scored["percentile_95"]),
+            "NEES inside": _level(scored.get("nees_inside")),
+            "median NEES": _of(scored["nees_median"]) if "nees_median" in scored else "",
         }
         del columns[left_out]
         rows.append(columns)

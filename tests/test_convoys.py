@@ -17,7 +17,7 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task):
     for name in roads.ROADS[convoys.CONVOYS[task]]:
         measured(name)
     recording, fleet = convoys.convoy(task, measured())
-    drive, truth = roads.seen(convoys.CONVOYS[task], measured())
+    drive, truth = roads.thinned(convoys.CONVOYS[task], measured())
     column, count, length = drive.observers[0], len(fleet.ids), len(fleet.t)
     assert count == (2 if task == "convoy-comma2k19" else 4)
     assert count * length <= len(drive.t)

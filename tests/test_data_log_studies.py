@@ -21,7 +21,7 @@ from coopoc.data.registry import read_log as load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.evaluate.scores import scored
 from coopoc.studies import neighbours, scene
-from coopoc.studies.roads import roads, seen
+from coopoc.studies.roads import roads, thinned
 from coopoc.study.publish import views
 from coopoc.study.report import report
 from coopoc.world.storage import digest, read_recording, save_recording
@@ -283,6 +283,6 @@ def test_a_report_of_a_log_shows_no_settings_of_simulated_noise(folders, tmp_pat
 
 def test_a_log_that_is_a_task_needs_a_truth(folders):
     assert [*roads(folders / "with"), *roads(folders / "without")] == ["with", "without"]
-    assert len(seen("with", folders / "with")[1].t)
+    assert len(thinned("with", folders / "with")[1].t)
     with refused("must hold a truth"):
-        seen("without", folders / "without")
+        thinned("without", folders / "without")

@@ -14,8 +14,7 @@ from coopoc import V2X, CooperativeFilter, Fleet, Kalman, Recording, Sensors, ob
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS
 from coopoc.studies import benchmark
-from coopoc.studies.roads import ROADS, road_row, roads
-from coopoc.studies.roads import seen as thinned
+from coopoc.studies.roads import ROADS, road_row, roads, thinned
 
 TURNS = AS_STATED._replace(heading=0.1, scale=0.03, lasts=300.0, absent=-np.inf)
 """Errors of heading and scale, and no guard: the rivals' extended Kalman filter."""

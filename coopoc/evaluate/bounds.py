@@ -16,7 +16,7 @@ from ..kernels.poses.odometry import UNKNOWN_HEADING_RAD2
 from ..kernels.stars.messages import FORGOTTEN
 from ..workers import one_thread, progress_bar
 from ..world.body_frames import body_motion, midway, true_heading, turned
-from ..world.fleet import Fleet, columns
+from ..world.fleet import Fleet, columns, same_drive
 from ..world.links import Links, spherical
 from ..world.recording import Recording, Vehicles
 from ..world.sensing import find_links
@@ -197,7 +197,7 @@ def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -
         InputError: a recording of other vehicles or steps, or one that lacks a link.
     """
     instance("recording", recording, Recording, "Give observe(..., remove_outliers=True).")
-    fleet.require(recording.ids, recording.t)
+    same_drive(fleet, recording.ids, recording.t)
     recorded, wanted = (
         list(zip(of.step.tolist(), of.observer.tolist(), of.neighbour.tolist(), strict=True))
         for of in (recording.links, links)

@@ -11,7 +11,7 @@ from ..kernels.covariances import normalised
 from ..methods.track import UNSOUND, Track, of_recording
 from ..plugins import called
 from ..world.body_frames import true_heading, turned
-from ..world.fleet import Fleet
+from ..world.fleet import Fleet, same_drive
 from ..world.links import wrap
 from ..world.recording import Recording
 
@@ -27,7 +27,7 @@ def _truth(track: Track, fleet: Fleet) -> Floats:
     track = instance("track", track, Track, "A method makes one of a recording: the track stands before the fleet.")
     fleet = instance("fleet", fleet, Fleet, "Score a track against its fleet: the track stands before the fleet.")
     egos = np.array(track.egos, dtype=np.int64)
-    fleet.require((track.ids or fleet.ids)[: len(fleet.ids)], track.t)  # landmarks come last and have no truth
+    same_drive(fleet, (track.ids or fleet.ids)[: len(fleet.ids)], track.t)  # landmarks come last and have no truth
     hint = "Score a track against the fleet that its recording was observed from."
     refuse("track.egos", egos, egos >= len(fleet.ids), f"must be columns of the fleet, 0..{len(fleet.ids) - 1}", hint)
     return fleet.position[:, egos]

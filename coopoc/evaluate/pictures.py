@@ -9,7 +9,7 @@ from ..arrays import Floats, instance, number
 from ..errors import InputError, shown
 from ..methods.track import Track
 from ..text import picture
-from ..world.fleet import Fleet
+from ..world.fleet import Fleet, same_drive
 from ..world.recording import Recording
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def plot_track(
     fair = max(len(track.t) // 40, 1)
     every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
     if fleet is not None:
-        instance("fleet", fleet, Fleet).require((track.ids or fleet.ids)[: len(fleet.ids)], track.t)
+        same_drive(instance("fleet", fleet, Fleet), (track.ids or fleet.ids)[: len(fleet.ids)], track.t)
     ax = axes(ax)
     for k, ego in enumerate(track.egos):
         color = COLORS[k % len(COLORS)]

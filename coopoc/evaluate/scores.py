@@ -65,7 +65,7 @@ def scored(
     """
     seconds, parts, squares = 0.0, list[dict[str, AnyArray]](), list[Floats]()
     there = np.isfinite(recording.velocity[0][:, [recording.ids.index(ego) for ego in egos], 0])
-    known = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
+    has_truth = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
     for part in slabs(recording, len(egos)):
         track = follow(method, part, egos)
         wanted = tuple(map(part.ids.index, egos)), part.runs, *part.t.tolist()
@@ -77,9 +77,9 @@ def scored(
                 "Take egos in this order, every run, and the times of the recording.",
             )
         seconds += track.seconds
-        parts.append(_errors(track, drive, part, quantiles) if known else innovation_columns(track, part))
+        parts.append(_errors(track, drive, part, quantiles) if has_truth else innovation_columns(track, part))
         parts[-1] |= online_columns(track, part, method)
-        if not known:
+        if not has_truth:
             continue
         if metric:
             parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)

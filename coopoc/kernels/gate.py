@@ -126,8 +126,8 @@ def vote(votes: Vector, moved: Vector, process: Vector, fix: Vector, variance: V
     spread = votes[6] + (process[0] + process[1] + process[2]) / 3.0
     o, gap = 0.0 * spread, subtract(fix, at)
     q, other = apart_by(gap, variance, spread), apart_by(subtract(gap, apart), variance, spread)
-    seen = choose(NO_FIX_M2 - variance[0], o + 1.0, o)
-    agrees, far = choose(MOST - q, seen, o), choose(q - MOST, seen, o)
+    has_fix = choose(NO_FIX_M2 - variance[0], o + 1.0, o)
+    agrees, far = choose(MOST - q, has_fix, o), choose(q - MOST, has_fix, o)
     begins = choose(0.5 - ours, agrees + far, o)
     new = choose(other - MOST, far, o)
     ours, theirs = ours + choose(begins, o + 1.0, agrees), choose(begins, o, choose(new, o + 1.0, theirs + far))

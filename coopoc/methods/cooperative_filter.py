@@ -15,7 +15,6 @@ from ..kernels.stars.cooperative_state import Model
 from ..kernels.stars.messages import FORGOTTEN
 from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
-from ..world.sensors import Sensors
 from ..world.v2x import Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .gaps import in_stretches
@@ -254,7 +253,7 @@ class CooperativeFilter(Checked):
         return follow_egos(self, recording, egos, run, notes)
 
 
-def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:
+def otherwise(ego: str, estimates: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:
     """Notes on what differs from the stated noise in the second half of a drive, by mean squares over runs and steps.
 
     A level that no measurement has changed has no note. Where fixes are assumed to err more than stated, low levels of
@@ -262,7 +261,7 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
 
     Args:
         ego: its name.
-        found: (R, T, 13) errors that last, whether it slips, whether it is alone, and levels.
+        estimates: (R, T, 13) errors that last, whether it slips, whether it is alone, and levels.
         fix: factor of the stated deviation of fixes that was assumed.
         stated: deviations of the errors of the compass, rad, and of ranges, m; errors within them have no note.
 
@@ -271,10 +270,10 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     >>> otherwise("a", np.array([[[0.0] * 7 + [0.4] + [1.0] * 5]]), 2.0)  # of a road, where nothing was wrong
     []
     """
-    found = found[:, np.isfinite(found[..., 4]).any(axis=0)]  # from where it knows where it is
-    late = found[:, found.shape[1] // 2 :]
+    estimates = estimates[:, np.isfinite(estimates[..., 4]).any(axis=0)]  # from where it knows where it is
+    late = estimates[:, estimates.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
-    usual[5:7] = np.nanmean(found[..., 5:7], axis=(0, 1))
+    usual[5:7] = np.nanmean(estimates[..., 5:7], axis=(0, 1))
     usual[len(FOUND_UNITS) :][(late[..., len(FOUND_UNITS) :] == 1.0).all(axis=(0, 1))] = np.nan
     usual[10:12] *= fix
     least = np.maximum(NOTED_ERRORS, (0.0, 0.0, *stated, 0.0, 0.0, 0.0))
@@ -321,13 +320,9 @@ def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
     if sensors is None:
         return AS_STATED
     if measured and priors == Priors():
-        priors = NO_ODOMETRY if sensors.velocity_reading == "fixes" else on_roads(sensors)
+        on_roads = ON_ROADS if sensors.velocity_std_ratio > 0.0 else STATED  # a ratio is assumed where none is stated
+        priors = NO_ODOMETRY if sensors.velocity_reading == "fixes" else on_roads
     return priors
-
-
-def on_roads(sensors: Sensors) -> Priors:
-    """Priors of measurements: a share of the speed is what is assumed where none is stated."""
-    return ON_ROADS if sensors.velocity_std_ratio > 0.0 else STATED
 
 
 def model_of(noise_model: NoiseModel, priors: Priors) -> Model:

@@ -99,8 +99,8 @@ def filter_stars(
     """
 
     def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
-        known = assumptions(recording, noise_model, ego, inbox)._replace(**assumed)
-        yield Estimate(*kernel(measurements(recording, ego, inbox, sent), known))
+        assumed_noise = assumptions(recording, noise_model, ego, inbox)._replace(**assumed)
+        yield Estimate(*kernel(measurements(recording, ego, inbox, sent), assumed_noise))
 
     return follow_egos(method, recording, egos, run, noise_model.notes)
 

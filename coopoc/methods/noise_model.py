@@ -11,7 +11,7 @@ from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..plugins import find
 from ..text import short_repr
-from ..world.fleet import Fleet
+from ..world.fleet import Fleet, same_drive
 from ..world.inbox import Inbox
 from ..world.links import vector_cov
 from ..world.recording import Recording, check_recording
@@ -78,7 +78,7 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> "NoiseModel":
         """The standard deviations of `sensors`, process noise from the measured pace; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        sensors = instance("sensors", sensors, Sensors).check_assumed().known()
+        sensors = instance("sensors", sensors, Sensors).check_assumed().assumable()
         compass = sensors.heading_std, sensors.heading_bias_std
         sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
         return cls("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
@@ -105,7 +105,7 @@ class NoiseModel:
             fleet: their true motion.
         """
         recording = instance("recording", recording, Recording)
-        instance("fleet", fleet, Fleet).require(recording.ids, recording.t)
+        same_drive(instance("fleet", fleet, Fleet), recording.ids, recording.t)
         change, by = _held_out(cls, recording, fleet) if recording.measured else (-np.inf, 0.0)
         if change + by < 0.0:
             return cls._constant(recording, fleet)
@@ -145,7 +145,7 @@ class NoiseModel:
         if self.process_std is not None:
             variance: Floats = np.square(self.process_std)[None, None, None]
         elif self.fleet is not None and self.sensors is not None:
-            self.fleet.require(recording.ids, recording.t)
+            same_drive(self.fleet, recording.ids, recording.t)
             variance = np.square(dt * self.sensors.velocity_std(self.fleet.velocity[None, :, followed], 1e-6))
         elif inbox is None:
             variance = own_variances(motion_noise(self, dt), velocity[:, :, followed], dt, first)

@@ -33,13 +33,13 @@ def with_odometry(
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh = new_state(motion_noise(noise_model, recording.dt))
     variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)
-    given = gnss, velocity, fresh, variance, columns, recording.dt
-    if not correct_drives(*given, np.empty((0, 0, 0, 3))):
+    drives = gnss, velocity, fresh, variance, columns, recording.dt
+    if not correct_drives(*drives, np.empty((0, 0, 0, 3))):
         return recording, noise_model
-    found = np.zeros(velocity.shape)
-    correct_drives(*given, found)
-    velocity, extra = velocity.copy(), found[..., 2]
-    velocity[..., :2] += found[..., :2]
+    corrections = np.zeros(velocity.shape)
+    correct_drives(*drives, corrections)
+    velocity, extra = velocity.copy(), corrections[..., 2]
+    velocity[..., :2] += corrections[..., :2]
     notes = [*noise_model.notes]
     for n in columns.tolist():
         if (failed := np.asarray((extra[:, :, n] > 0).any(axis=0))).any():

@@ -96,11 +96,11 @@ class Track:
             self.__dict__[name] = texts(name, getattr(self, name))
         if self.ids:
             columns("egos", self.egos, self.ids)
-        given = named("extras", self.extras, "Give name -> (R, T, E), {} for none.")
+        by_name = named("extras", self.extras, "Give name -> (R, T, E), {} for none.")
         each, by_link = ("(R, T, E)", x.shape[:3]), dict[int, tuple[str, tuple[int, ...]]]()
         if self.neighbours is not None:
             by_link[2] = "(R, L)", self.neighbours.shape[:2]
-        extras = {name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in given.items()}
+        extras = {name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in by_name.items()}
         self.__dict__["extras"] = extras
         if self.absent is not None:
             self.__dict__["absent"] = checked("absent", self.absent, "(T, E)", x.shape[1:3], bool)

@@ -72,10 +72,10 @@ class Incremental:
             x[k] = vector if turns[-1] else space.join(vector[None, :d])[0]
         points(space, len(x), "values", x)
         every, fresh = [*self.names, *new], {name: first + k for k, name in enumerate(new)}
-        place = ChainMap(fresh, self._place)
+        index_of_name = ChainMap(fresh, self._place)
 
         def index(node: Any) -> int:
-            known_index = index_of(node, place, every)
+            known_index = index_of(node, index_of_name, every)
             return known_index if known_index >= first else self._index(known_index)
 
         made = list[Factor]()
@@ -170,8 +170,8 @@ class Incremental:
             at = np.array(here).reshape(len(keys), part.space.ambient)
             points = np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
             vague = [Factor("position", points[:, None], at[points, :d], std=np.full(d, LOOSE))] if len(points) else []
-            known = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
-            free = [keys[part.index(name)] for name in assess(known, at, covariance=False).unobservable]
+            old_fixed = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
+            free = [keys[part.index(name)] for name in assess(old_fixed, at, covariance=False).unobservable]
             loose &= {*free} | (loose - {*keys})
         return sorted(loose)
 

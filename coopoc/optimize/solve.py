@@ -115,7 +115,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     load(*LIBRARIES)
     began, earlier = clock(), problem.search.seconds
     backend.check(problem, options)
-    if given := problem.x0 is not None and not np.array_equal(problem.x0, problem.search.x0):  # type: ignore[arg-type]
+    if has_start := problem.x0 is not None and not np.array_equal(problem.x0, problem.search.x0):  # type: ignore[arg-type]
         problem = problem.replace_unchecked(search=Search(notes=problem.search.notes))
     problem = started(problem)
     start, placed = _start(problem)
@@ -134,7 +134,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     result = backend.run(problem, start, options)
     if searching and constraints:
         problem, result = _drawn(problem, backend, options, result)
-    elif given and not constraints:
+    elif has_start and not constraints:
         problem, result = _challenged(problem, backend, options, result, whole)
     search = problem.search
     solved = clock()

@@ -25,7 +25,7 @@ from .solve import solve
 
 UNLIKELY_FACTOR = 30.0
 """Factor by which residuals may differ from what is stated; on real graphs they are 0.2 to 1 times as large."""
-MISTAKEN = (
+COVARIANCE_HINT = (
     "Are its matrices covariances where the format has information, or the reverse, its angles in rad, lengths in m?"
 )
 
@@ -77,7 +77,7 @@ def solve_file(
         if joint["rival"] >= MIN_AGREEING:
             say("{body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint))
     if size is not None and not 1 / UNLIKELY_FACTOR < size < UNLIKELY_FACTOR:
-        say(f"residuals are {size:.2g} times what the file states. {MISTAKEN}")
+        say(f"residuals are {size:.2g} times what the file states. {COVARIANCE_HINT}")
     return int(solution.status is not Status.SOLVED)
 
 

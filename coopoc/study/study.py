@@ -106,8 +106,8 @@ class Study:
     def values(self) -> dict[str, list[Scalar]]:
         """Values of each axis."""
         if isinstance(self.grid, Mapping):
-            given = {name: listed(name, values, "Give a tuple of values.") for name, values in self.grid.items()}
-            return {k: [v.item() if isinstance(v, np.generic) else v for v in values] for k, values in given.items()}
+            lists = {name: listed(name, values, "Give a tuple of values.") for name, values in self.grid.items()}
+            return {k: [v.item() if isinstance(v, np.generic) else v for v in values] for k, values in lists.items()}
         hint = "Give {name: values}, or a list of {name: value}."
         names = dict.fromkeys(name for p in listed("grid", self.grid, hint) for name in named("grid", p, hint))
         return {name: list(dict.fromkeys(p[name] for p in self.grid if name in p)) for name in names}

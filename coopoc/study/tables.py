@@ -239,9 +239,9 @@ def pivot(
         of.setdefault(tuple(label(name, row[name]) for name in down), {})[text] = row
     body = []
     for labels in sorted(of, key=smooths):
-        found = (of[labels].get(text) for text in titles)
+        matches = (of[labels].get(text) for text in titles)
         entries = (
-            Interval(row["mean"], row["low"], row["high"], row["n"]) if row and row["n"] else None for row in found
+            Interval(row["mean"], row["low"], row["high"], row["n"]) if row and row["n"] else None for row in matches
         )
         body.append((*labels, *entries))
     missing = int(summary["missing"].sum())

@@ -84,17 +84,6 @@ class Fleet:
             sha.update(getattr(self, name).tobytes())
         return sha.hexdigest()
 
-    def require(self, ids: Sequence[str], t: Floats) -> None:
-        """InputError unless the fleet has these vehicles in this order, and its steps are at times t (T,) s.
-
-        >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-        >>> fleet.require(("b",), fleet.t)
-        Traceback (most recent call last):
-        coopoc.errors.InputError: fleet = Fleet(unnamed: 1 vehicles x 2 steps, dt 0.1 s): ids and times differ from \
-those that were recorded. Give the fleet that was observed, its vehicles in the same order.
-        """
-        same_drive(self, ids, t)
-
     def index(self, vehicle: str | int) -> int:
         """Column of a vehicle given by its id or its index; InputError if there is none."""
         return column("vehicle", vehicle, self.ids)
@@ -147,7 +136,14 @@ def _check_gaps(fleet: Fleet) -> None:
 
 
 def same_drive(noun: Any, ids: Sequence[str], t: Floats) -> None:
-    """InputError unless a Fleet or Recording has these vehicles in this order, and its steps are at times t (T,) s."""
+    """InputError unless a Fleet or Recording has these vehicles in this order, and its steps are at times t (T,) s.
+
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> same_drive(fleet, ("b",), fleet.t)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: fleet = Fleet(unnamed: 1 vehicles x 2 steps, dt 0.1 s): ids and times differ from those \
+that were recorded. Give the fleet that was observed, its vehicles in the same order.
+    """
     if tuple(ids) != noun.ids or len(t) != len(noun.t) or not np.allclose(t, noun.t, 0, 0.01 * noun.dt):
         kind = type(noun).__name__.lower()
         hint = f"Give the {kind} that was observed, its vehicles in the same order."

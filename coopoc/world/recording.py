@@ -240,8 +240,8 @@ class Recording:
         (col,) = columns("vehicle", [vehicle], self.ids)
         least = number("shortest", shortest, kind=int)
         there = np.isfinite(self.velocity[0, :, col, 0])
-        known: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
-        firsts = [(a + int(np.argmax(known[a:b])), b) for a, b in stretches(there) if known[a:b].any()]
+        has_fix: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
+        firsts = [(a + int(np.argmax(has_fix[a:b])), b) for a, b in stretches(there) if has_fix[a:b].any()]
         return tuple((a, b) for a, b in firsts if b - a >= least)
 
     @cached_property

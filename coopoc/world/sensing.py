@@ -67,7 +67,7 @@ def observe(
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
     one_of("frame", frame, Frame)
-    assumed = sensors.known() if assumed is None else instance("assumed", assumed, Sensors)
+    assumed = sensors.assumable() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
     links = find_links(fleet, watching, v2x, sensors.min_range, standing)
     runs = runs_in_memory(runs, 8 * fleet.present.size + 4 * len(links))

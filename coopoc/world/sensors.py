@@ -136,7 +136,7 @@ class Sensors:
 
         return np.sqrt(own_variances(self.motion_noise(dt), velocity, dt))
 
-    def known(self) -> "Sensors":
+    def assumable(self) -> "Sensors":
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""
         return replace(self, gnss_bias=(0.0, 0.0), outliers=None)
 

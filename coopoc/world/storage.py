@@ -14,7 +14,7 @@ from numpy.lib import format as npy
 from ..arrays import AnyArray, instance
 from ..errors import InputError, said
 from ..paths import given_path, write
-from .fleet import Fleet
+from .fleet import Fleet, same_drive
 from .links import Links
 from .outliers import Fault, Outliers
 from .recording import Body, Recording
@@ -61,7 +61,7 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
     if (path := given_path(path)).suffix != ".npz":
         raise InputError("path", str(path), "must end in .npz", "NumPy would append it.")
     if truth is not None:
-        truth.require(recording.ids, recording.t)
+        same_drive(truth, recording.ids, recording.t)
     settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
     words = {"ids": recording.ids, "notes": recording.notes, **settings}
     arrays = _arrays(recording)

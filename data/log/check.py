@@ -47,7 +47,7 @@ from .relative import (
 )
 from .residuals import Check, filtered, without_wild
 
-MISTAKEN = (
+WRONG_UNITS = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
     (0.2, 0.4, "Is speed in km/h? Name it speed_kmh. Or in feet a second? Speeds are in m/s."),
     (0.42, 0.55, "Is speed in knots? Name it speed_knots. Or in miles an hour? Speeds are in m/s."),
@@ -295,7 +295,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
             "or, on a bend at one speed, a clock."
         )
     if distance is not None and not 0.8 <= distance <= 1.25:
-        unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
+        unit = next((hint for low, high, hint in WRONG_UNITS if low < distance < high), "Check the units of both.")
         sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
     elif name in c.failing and not sentences:
         moved, driven, *_ = moves(c, column)

@@ -24,8 +24,8 @@ LEAST_FORWARD = 0.1
 """Share of a velocity along which odometry counts, or back, that shows by what it is late."""
 UNITS_APART = 0.2
 """Relative error of lengths from which their unit is wrong."""
-LEAST_COUNT, FEWEST = 20, 6
-"""Measurements from which a statistic is reported, and from which causes are told."""
+LEAST_COUNT, MIN_SAMPLES = 20, 6
+"""Measurements from which a statistic is reported, and from which causes are estimated."""
 FEW_PARTS, SURELY = 10, 3e-5
 """Parts of a drive below which a standard error is itself uncertain; chance of SURE_ERRORS to one side."""
 MOVED_STDS = 10.0
@@ -33,7 +33,7 @@ MOVED_STDS = 10.0
 LEAST_CORRELATION = 0.97
 """Correlation of the displacements of fixes and odometry that noise alone does not reach."""
 MIN_OWN_SHARE = 0.02
-"""Least share of a cause's sum of squares that the other causes do not explain, so that it can be told from them."""
+"""Least share of a cause's sum of squares that no other cause explains, so that it can be separated."""
 OUTLYING, TENTHS, DRIVE_PARTS = 5.0, 10, 40
 """Multiples of the median residual beyond which one is left out; parts of a drive in which a filter is judged, and
 those whose estimates give the standard error."""
@@ -79,7 +79,7 @@ def factors(
     """
     k, all_of = x.shape[1], np.column_stack([y, x, x if z is None else z])
     none = Estimate(np.zeros(k), np.full(k, np.inf))
-    if len(y) < FEWEST:
+    if len(y) < MIN_SAMPLES:
         return none
     if groups is not None:
         all_of = _centred(all_of, groups)
@@ -270,11 +270,11 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
         alone = 1.0 / np.diag(np.linalg.inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
         if extra and ((alone < MIN_OWN_SHARE) & unit.any(axis=1)).any():
             continue
-        found = factors(y, causes.T, noise)
-        if np.linalg.norm(found.value[extra]) >= 2.0 * np.linalg.norm(found.error[extra]):
+        explained = factors(y, causes.T, noise)
+        if np.linalg.norm(explained.value[extra]) >= 2.0 * np.linalg.norm(explained.error[extra]):
             break
     of_causes = min(len(causes), 3)
-    for whole, part in zip((value, error), found, strict=True):
+    for whole, part in zip((value, error), explained, strict=True):
         whole[:of_causes] = part[:of_causes]
         if len(extra) == 2:
             whole[3:] = part[extra]
@@ -316,11 +316,11 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
     x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
     value, error = factors(c.relative[there, 0], x, noise, groups, z)
-    seen = np.flatnonzero(ends[there].any(axis=0))
-    error[seen[seen == reference]] = 0.0
-    if reference is None and len(seen):
-        apart = np.abs(np.subtract.outer(value[seen], value[seen]))
-        return clocks(c, alike, seen[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))])
+    measured = np.flatnonzero(ends[there].any(axis=0))
+    error[measured[measured == reference]] = 0.0
+    if reference is None and len(measured):
+        apart = np.abs(np.subtract.outer(value[measured], value[measured]))
+        return clocks(c, alike, measured[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))])
     return Estimate(value, ERRORS_LAST * error), made
 
 
@@ -400,7 +400,7 @@ def against_truth(c: Check) -> Check:
     fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = (
-        residual_of(rec, x, c.log.summary.told)[1],
+        residual_of(rec, x, c.log.summary.reversed_pairs)[1],
         [noise.range_std, noise.world_azimuth_std, noise.inclination_std],
     )
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)

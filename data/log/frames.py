@@ -14,7 +14,7 @@ from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD
 from ..cells import factors
-from .units import ANGLES, KINDS, Rows, Summary, in_group, only, place, stated_std
+from .units import ANGLES, KINDS, Rows, Summary, in_group, only, row_of, stated_std
 
 if TYPE_CHECKING:
     from .motion import Member, Steps
@@ -63,7 +63,7 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
     if 0 < back.mean() < DISORDER_SHARE:
         who = ", ".join(rows["vehicle"][back].unique())
         summary.assume(
-            f"stamps of {who} go back (first: {place(rows[back])}), as a clock that was set, or a logger that began "
+            f"stamps of {who} go back (first: {row_of(rows[back])}), as a clock that was set, or a logger that began "
             "anew, whose parts are logs of their own; rows are in their order"
         )
     return rows
@@ -85,7 +85,7 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     early = rows[rows["arrival"] < t - 1e-6]
     if len(early):
         raise InputError(
-            f"{place(early)}, column arrival",
+            f"{row_of(early)}, column arrival",
             f"{early['arrival'].iloc[0]:.6f} s, sent at {early['t'].iloc[0]:.6f} s",
             "must not come before the message was sent",
             'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.',
@@ -129,7 +129,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
         return rows, origin
     if origin is None and len(metric):
         raise InputError(
-            f"{place(metric)}, x",
+            f"{row_of(metric)}, x",
             "metres",
             "stand beside fixes in degrees",
             "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "

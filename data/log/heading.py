@@ -140,10 +140,10 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
     >>> course.at(np.array([50.0])).round(1), mirrored  # 10 rad
     (array([-2.6]), False)
     """
-    found = [*map(poses_of, way.parts(gap))]
-    if not found:
+    per_part = [*map(poses_of, way.parts(gap))]
+    if not per_part:
         return None, False
-    t, heading, variance, squares = (np.concatenate(each) for each in zip(*found, strict=True))
+    t, heading, variance, squares = (np.concatenate(each) for each in zip(*per_part, strict=True))
     ours, others = squares.reshape(-1, 2).sum(axis=0)
     known, rate = np.isfinite(heading), way.yaw_rate
     if not known.any():

@@ -51,7 +51,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
         back = far[~reached]
         heard = back["neighbour"] * len(members) + back["observer"]
         own = measured["observer"] * len(members) + measured["neighbour"]
-        summary.told = np.setdiff1d(heard, own).tolist()
+        summary.reversed_pairs = np.setdiff1d(heard, own).tolist()
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
         both = both.drop_duplicates([*LINK_COLUMNS, "component"])
         if len(both) > len(measured):

@@ -24,7 +24,7 @@ from .heading import (
     step_means,
     unknown,
 )
-from .units import Rows, Summary, in_group, only, place
+from .units import Rows, Summary, in_group, only, row_of
 
 BETWEEN = (0.25, 0.5, 0.75)
 """Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
@@ -44,7 +44,7 @@ COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverse
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
 HOLDS = "fixes that stay while the odometry moves on"
 CLOCKWISE = "yaw rates are anticlockwise, but fixes of {} turn the other way: scale=yaw_rate:-1 mends it"
-DERIVED = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
+NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
 
 VELOCITIES = ("vx", "vy", "vz")
 AHEAD: Floats = np.array([1.0, 0.0, 0.0])
@@ -314,7 +314,7 @@ def _in_world(
         return means - beside, Signal(at[own & kept], at), heading
     if len(speed.t):
         raise InputError(
-            f"{place(speeds)}, speed",
+            f"{row_of(speeds)}, speed",
             f"of {name}, which has no heading",
             "needs heading, compass_deg, or fixes of a moving vehicle",
             "Add one, or give vx and vy.",
@@ -326,7 +326,7 @@ def _in_world(
             "cannot be placed",
             "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z.",
         )
-    summary.assume(DERIVED, name)
+    summary.assume(NO_ODOMETRY, name)
     return None, way.fixes, heading._replace(wanders=shown.wanders)
 
 

@@ -415,8 +415,8 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     if dt is None:
         dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST_STEP):.3g}")
         if dense < step:
-            seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
-            summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
+            interpolated = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
+            summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {interpolated}")
             step = dense
         seldom = float(f"{min(pairs, fixes, LONGEST_STEP):.3g}")  # unknown where there are no pairs
         if not body and pairs > step and seldom > step:

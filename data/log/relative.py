@@ -157,7 +157,7 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
     """Who measures whom -> by what that is off where it is for long, though an offset is taken off; and in words, with
     whom else it fits."""
     links, ids, measured = c.world.links, c.world.ids, c.world.relative[0, :, 0]
-    found = dict[tuple[str, str], tuple[float, str]]()
+    misfit_of = dict[tuple[str, str], tuple[float, str]]()
     t, names = c.world.t - c.world.t[0], pairs(c, k, True)
     for rows in names.groupby(names).groups.values():
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]
@@ -174,8 +174,8 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         for like, gap in zip(ids, gaps.T, strict=True):
             if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE_RATIO * np.median(expected) < 0.2 * size:
                 text += f", as if to {like}"
-        found[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
-    return found
+        misfit_of[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
+    return misfit_of
 
 
 def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:

@@ -185,7 +185,7 @@ def filtered(log: Log) -> Check:
     world, noise = rec, rec.sensors
     if rec.body is not None:
         world = in_world(replace(rec, body=replace(rec.body, heading=heading[None])))
-    gap, residual = residual_of(world, x, log.summary.told)
+    gap, residual = residual_of(world, x, log.summary.reversed_pairs)
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
     flat, distance = distances(gap)
     expected = np.column_stack([both, both / flat**2, both / distance**2])
@@ -207,12 +207,12 @@ def distances(gap: Floats) -> list[Floats]:
     return [np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3)]
 
 
-def residual_of(world: Recording, x: Floats, told: Sequence[int] = ()) -> tuple[Floats, Floats]:
+def residual_of(world: Recording, x: Floats, reversed_pairs: Sequence[int] = ()) -> tuple[Floats, Floats]:
     """(L, 3) m, from observers to neighbours at positions x (T, N, 3), and measured less computed from these, NaN of
-    pairs that are `told` (`Summary`): they are of another's clock."""
+    pairs that are `reversed_pairs` (`Summary`): they are of another's clock."""
     links = world.links
     gap = x[links.step, links.neighbour] - x[links.step, links.observer]
     residual = world.relative[0] - np.column_stack(spherical(*gap.T))
     residual[:, 1:] = wrap(residual[:, 1:])
-    residual[np.isin(links.observer * len(world.ids) + links.neighbour, told)] = np.nan
+    residual[np.isin(links.observer * len(world.ids) + links.neighbour, reversed_pairs)] = np.nan
     return gap, residual

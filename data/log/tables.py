@@ -90,8 +90,8 @@ def _with_whole_stamps(frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.Da
     """The frame with stamps of whole seconds and nanoseconds beside them, as of ROS, in one column: t, if none is."""
     numbers = frame.select_dtypes("number")
     for name in numbers:
-        found = re.fullmatch(r"(.*?)n(?:ano)?(secs?)", str(name))
-        if found and (whole := found[1] + found[2]) in numbers:
+        match = re.fullmatch(r"(.*?)n(?:ano)?(secs?)", str(name))
+        if match and (whole := match[1] + match[2]) in numbers:
             frame = frame.assign(**{whole: frame[whole] + 1e-9 * frame[name]}).drop(columns=name)
             return frame if {"t", columns.get("t")} & {*frame} else frame.rename(columns={whole: "t"})
     return frame
@@ -154,8 +154,8 @@ def _of_partner(column: str) -> tuple[str, str] | None:
     kinds = [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")]
     kind = max(kinds, key=len, default="")
     partner = column[len(kind) + 1 :]
-    known = not kind or column in KINDS or partner in UNIT_SUFFIXES or column.endswith("_std")
-    return None if known else (kind, partner)
+    is_column = not kind or column in KINDS or partner in UNIT_SUFFIXES or column.endswith("_std")
+    return None if is_column else (kind, partner)
 
 
 def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame:

@@ -66,8 +66,17 @@ ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
 Rows = pd.DataFrame
 """L measurements, a row each, with the columns of BLANK, `file` and `row` (from 1, the header not counted)."""
-NONE = np.nan
-BLANK = {"t": NONE, "vehicle": "", "kind": "", "partner": "", "value": NONE, "std": NONE, "arrival": NONE, "true": 0.0}
+MISSING = np.nan
+BLANK = {
+    "t": MISSING,
+    "vehicle": "",
+    "kind": "",
+    "partner": "",
+    "value": MISSING,
+    "std": MISSING,
+    "arrival": MISSING,
+    "true": 0.0,
+}
 """t in s, of a message when it was sent, NaN of a place without a time; vehicle measures, or sends; partner is
 measured, or receives, "" for none or for a message to all; value and std in the unit of the kind, NaN where there is
 none; arrival in s, infinite for a message that was lost; true is 1 for what is of the truth, not measured."""
@@ -85,7 +94,7 @@ def of_kinds(frame: pd.DataFrame, file: str) -> Rows:
     """Rows of a table with a column for each kind, and perhaps KIND_std beside it; an empty cell is no measurement."""
     columns = frame[frame.columns.intersection([*BLANK])].fillna({"partner": "", "true": 0.0})
     parts = [
-        columns.assign(kind=kind, value=frame[kind], std=frame.get(f"{kind}_std", NONE))
+        columns.assign(kind=kind, value=frame[kind], std=frame.get(f"{kind}_std", MISSING))
         for kind in KINDS
         if kind in frame
     ]
@@ -108,7 +117,7 @@ def stated_std(rows: Rows, *kinds: str) -> float:
     return float(np.sqrt((std**2).mean()))
 
 
-def place(rows: Rows) -> str:
+def row_of(rows: Rows) -> str:
     """File and row of the first."""
     first = rows.iloc[0]
     return f"{first['file']}: row {first['row']}"
@@ -179,7 +188,7 @@ def check_values(rows: Rows) -> None:
             first, cell = kind[wrong].iloc[0], actual[wrong].iloc[0]
             others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[first].name)
             raise InputError(
-                f"{place(rows[wrong])}, {column.format(kind=first)}",
+                f"{row_of(rows[wrong])}, {column.format(kind=first)}",
                 (repr(cell) if cell else "empty") if actual is partner else f"{cell:.10g}",
                 allowed.format(limit=KINDS[first].limit),
                 hint.format(kinds=others) + DECIMAL * (first in ("latitude", "longitude")),
@@ -227,7 +236,7 @@ class Summary:
         odometry: s, from one sample of it to the next, 0 where there is none.
         rows: how many numbers were logged.
         shown: vehicles of which fixes alone have shown the velocity, or its direction without a gyro.
-        told: observer times members, plus neighbour, of pairs that have only what the other end measured.
+        reversed_pairs: observer times members, plus neighbour, of pairs that have only what the other end measured.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
 
     >>> summary = Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3})
@@ -251,7 +260,7 @@ class Summary:
     odometry: float = 0.0
     rows: int = 0
     shown: list[str] = field(default_factory=list)
-    told: list[int] = field(default_factory=list)
+    reversed_pairs: list[int] = field(default_factory=list)
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
     def count(self, what: str, number: int) -> None:
@@ -263,7 +272,7 @@ class Summary:
         """Add rows, or a number of things, to what is not in the Recording."""
         number = rows if isinstance(rows, int) else len(rows)
         if number:
-            before, first = self.refused.get(reason, (0, where if isinstance(rows, int) else place(rows)))
+            before, first = self.refused.get(reason, (0, where if isinstance(rows, int) else row_of(rows)))
             self.refused[reason] = before + number, first
 
     def leave(self, what: str, number: int) -> None:

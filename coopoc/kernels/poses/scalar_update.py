@@ -248,8 +248,8 @@ def update_relative(
         The bits, and those of the components that are rejected.
     """
     (k, o), x, linear = ends, poses.x, poses.linear
-    place = landmark if o < 0 else linear[o : o + 3]
-    polar = direction(place[0] - linear[k], place[1] - linear[k + 1], place[2] - linear[k + 2])
+    position = landmark if o < 0 else linear[o : o + 3]
+    polar = direction(position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2])
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):
             continue

@@ -253,8 +253,8 @@ def step(
         vehicles: (count,) which they are.
         count: of them.
     """
-    slips, other, known = model.slip > 0.0, tries.other, own[MORE] > 0.0 and tries.doubts[PENDING] == KNOWN
-    if not known:
+    slips, other, failure_known = model.slip > 0.0, tries.other, own[MORE] > 0.0 and tries.doubts[PENDING] == KNOWN
+    if not failure_known:
         tries.doubts[PENDING] = tries.doubts[PENDING] + own[MORE] if own[MORE] > 0.0 else 0.0
     f.ego[NOW] = f.ego[CORRECTED] = 0.0
     if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
@@ -267,16 +267,16 @@ def step(
         copy_rows(rows, tries.rows)
     attempt(f, model, own, rows, vehicles, count)
     fails = tries.doubts[PENDING] > 0.0
-    if slips and surprised(f, fails or known):
+    if slips and surprised(f, fails or failure_known):
         other.ego[NOW] = 1.0
-        if fails or known:
-            corrected_motion(other, tries.own, tries.own[MORE] if known else tries.doubts[PENDING])
+        if fails or failure_known:
+            corrected_motion(other, tries.own, tries.own[MORE] if failure_known else tries.doubts[PENDING])
         attempt(other, model, tries.own, tries.rows, vehicles, count)
-        probably = chance(other, f, own[DT], fails, known)
+        probably = chance(other, f, own[DT], fails, failure_known)
         if probably >= 0.5:
             copy_filter(other, f)
             tries.doubts[PENDING] = KNOWN if fails else tries.doubts[PENDING]
-        elif known and not heard(f, True):
+        elif failure_known and not heard(f, True):
             tries.doubts[PENDING] = own[MORE]
         f.ego[SLIPPED] = probably
     elif f.ego[NUMBERS] > 0.0:

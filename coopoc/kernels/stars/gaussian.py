@@ -253,7 +253,7 @@ def innovate(g: Gaussian, h: Rows) -> float:
     """
     project(g, h)
     if h.three[CURVE] > 0.0:
-        bend(h)
+        add_curvature(h)
     gain, wide, gap, cov = h.gain, len(g.x) // LANES, vector_at(h.three, GAP // 3), block_at(h.matrix, COV // 9)
     x, d = whitened(h, 0, gap[0], h.three[VARIANCE] + cov[0])
     s = cov[1] * d
@@ -272,7 +272,7 @@ def innovate(g: Gaussian, h: Rows) -> float:
 
 
 @inside
-def bend(h: Rows) -> None:
+def add_curvature(h: Rows) -> None:
     """Add the variance of the second-order terms of range, azimuth and inclination, which linear rows leave out.
 
     At a distance of d, u beyond and v and w beside the point of linearisation, they are, in m,

@@ -48,7 +48,7 @@ RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS 
 sum of squares of products m^2 of an error and the mean of those before it."""
 ERROR_MEMORY_S, PRODUCT_MEMORY_S = 1.0, 100.0
 """s, in which an error fades, and in which products do."""
-FEWEST = 3
+MIN_VEHICLES = 3
 """Vehicles whose errors show what is usual, and fixes in the mean of one that is trusted."""
 OF_ERROR, NEAREST = 3, 4
 """Behind an error in its row of `few`: its variance m^2, axes together, and, in order and not its own, the variance m^2
@@ -67,7 +67,7 @@ def usual_error(f: Filter, but: int) -> float:
         if status[TRUSTED] == 0.0:
             store(few[n], 0, vector_at(g.x, i // 3))
             few[n, OF_ERROR] = g.p[i, i] + g.p[i + 1, i + 1] + g.p[i + 2, i + 2]
-        elif status[COUNT] >= FEWEST:
+        elif status[COUNT] >= MIN_VEHICLES:
             store(few[n], 0, vector_at(status, MEAN // 3))
             few[n, OF_ERROR] = status[NOISE] / status[COUNT]
         else:
@@ -83,7 +83,7 @@ def usual_error(f: Filter, but: int) -> float:
             few[at, NEAREST] = few[at - 1, NEAREST]
             at -= 1
         few[at, NEAREST] = least
-    return float(few[(n - 1) // 2, NEAREST]) if n >= FEWEST else 0.0
+    return float(few[(n - 1) // 2, NEAREST]) if n >= MIN_VEHICLES else 0.0
 
 
 @part

@@ -421,11 +421,11 @@ def surprised(f: Filter, fails: bool) -> bool:
 
 
 @part
-def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> float:
+def chance(f: Filter, first: Filter, dt: float, fails: bool, failure_known: bool) -> float:
     """Probability of a slip after both tries of a step, from that before the step, or from the evidence that odometry
     `fails`. Once a failure is known, it does not end by itself."""
-    stays = 1.0 if known else math.exp(-dt / SLIP_DURATION_S)
-    begins = min(dt / (SLIP_DURATION_S if known else SLIP_INTERVAL_S), 0.5)
+    stays = 1.0 if failure_known else math.exp(-dt / SLIP_DURATION_S)
+    begins = min(dt / (SLIP_DURATION_S if failure_known else SLIP_INTERVAL_S), 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)

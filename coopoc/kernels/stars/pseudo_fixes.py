@@ -207,15 +207,15 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
             noise = cov_of(complete if fusion.naive else polar, relative, model.min_range)
         elif fusion.naive:
             theirs = scale(theirs, 0.0)
-        known, held = o + NOWHERE - variance[0], take(star.status, 5 * k + HELD)
-        store(fusion.x, k, choose_each(choose(known, held, o), position_of(star, k), nowhere))
+        has_position, held = o + NOWHERE - variance[0], take(star.status, 5 * k + HELD)
+        store(fusion.x, k, choose_each(choose(has_position, held, o), position_of(star, k), nowhere))
         held = take(star.status, 5 * k + NEW) if fusion.naive else held
         gap = subtract(gap, vector(complete))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
         f = choose(counts, f, o + 1.0)
-        store(fusion.used, k, (choose(known, counts, o),))
+        store(fusion.used, k, (choose(has_position, counts, o),))
         store(fusion.gap, k, gap)
         add_source(fusion, k, scale(theirs, f), scale(noise, f))
 

@@ -185,7 +185,7 @@ class PoseFilter:
         """Poses (R, S, N, 4) at the first step, and where members begin after a gap: NaN where a fix and a compass are,
         else those of `pose_start`; in a fleet NaN where it finds none."""
         there, every = present(recording), [first_poses(recording, self.begin, members)]
-        known: Bools = np.isfinite(recording.gnss[..., 0] + body_of(recording).heading).min(axis=0)
+        has_pose: Bools = np.isfinite(recording.gnss[..., 0] + body_of(recording).heading).min(axis=0)
         for column in members:
             starts = 1 + np.flatnonzero(there[1:, column] & ~there[:-1, column])
             for again, start in enumerate(starts.tolist(), 1):
@@ -193,7 +193,7 @@ class PoseFilter:
                     every.append(np.full_like(every[0], np.nan))
                 part = recording.between(start, min(start + int(START_SECONDS / recording.dt) + 2, len(there)))
                 with suppress(*[InputError] * (self.unit == "fleet")):
-                    if not known[start, column] and len(part.t) > 1:
+                    if not has_pose[start, column] and len(part.t) > 1:
                         one = PoseFilter("solo", gate=START_GATE)
                         every[again][:, column] = likely_poses(part, one, [column])[:, column]
         return np.stack(every, axis=1)

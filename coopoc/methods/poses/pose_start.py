@@ -160,8 +160,8 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     else:
         first = complete[np.sort(np.unique(places[complete], axis=0, return_index=True)[1])[:SEEN_PLACES]]
         step, at = recording.links.step[links[first]], places[first]
-        seen = np.where(np.isfinite(relative[first]), relative[first], np.pi / 2)
-        offset = way[step] + turned(to_vector(seen), turns[step])
+        polar = np.where(np.isfinite(relative[first]), relative[first], np.pi / 2)
+        offset = way[step] + turned(to_vector(polar), turns[step])
     position = at - turned(np.broadcast_to(offset, (len(angles), *offset.shape)), angles[:, None])
     return np.column_stack([position.reshape(-1, 3), np.repeat(angles, len(step))])
 

@@ -129,8 +129,8 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
             return ended(cov, step)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
-        scale, slope = own + (own == 0), _largest(problem, entries, np.abs(gradient))
-        flat = FLAT_CURVATURE + (slope / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
+        scale, steepness = own + (own == 0), _largest(problem, entries, np.abs(gradient))
+        flat = FLAT_CURVATURE + (steepness / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return replace(unknown, unobservable=nodes)

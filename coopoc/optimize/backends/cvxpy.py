@@ -14,9 +14,9 @@ def solver(problem: Problem, x: Floats) -> SolverResult:
         problem: that is solved.
         x: start, which a relaxation does not need.
     """
-    found = shor(problem)
-    extras = {"lower_bound": found.lower_bound, "rank_gap": found.rank_gap, "rounded_cost": found.cost}
-    return SolverResult(found.solution.x, found.solution.iterations, extras=extras)
+    relaxed = shor(problem)
+    extras = {"lower_bound": relaxed.lower_bound, "rank_gap": relaxed.rank_gap, "rounded_cost": relaxed.cost}
+    return SolverResult(relaxed.solution.x, relaxed.solution.iterations, extras=extras)
 
 
 BACKEND = Backend(

@@ -222,10 +222,10 @@ def callbacks(problem: Problem, factors: Sequence[Factor]) -> Callable[[int, int
     turned: Sequence[Floats] = ()
 
     def of(k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
-        def error(_: Any, found: Any, jacobians: Any) -> Any:
+        def error(_: Any, estimates: Any, jacobians: Any) -> Any:
             nonlocal at, linear, turned
-            if at is None or not found.equals(at, 0.0):
-                at, x = gtsam.Values(found), estimate(space, posed, found)
+            if at is None or not estimates.equals(at, 0.0):
+                at, x = gtsam.Values(estimates), estimate(space, posed, estimates)
                 linear, turned = linearise(space, bare, None, x), tangent(space, posed, x)
             if jacobians is not None:
                 for slot, i in enumerate(nodes):

@@ -187,7 +187,7 @@ def vector(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
     return x, y, z
 
 
-def seen(first: int, end: int) -> Formula:
+def spherical_part(first: int, end: int) -> Formula:
     """Of range, azimuth and inclination of the frame's vector those from `first` to before `end`: m, rad."""
     return lambda x, y, z, m=np: to_spherical(x, y, z, m)[first:end]
 
@@ -207,7 +207,7 @@ for _name, _frame, _first, _end in (
     ("body_spherical", "body", 0, 3),
 ):
     _flat = PLANE[: min(2, _end) - _first] or None  # without the inclination
-    measurement(_name, 2, SEEN[_first:_end], _frame, plane=_flat)(seen(_first, _end))  # type: ignore[arg-type]
+    measurement(_name, 2, SEEN[_first:_end], _frame, plane=_flat)(spherical_part(_first, _end))  # type: ignore[arg-type]
 
 
 @measurement("speed", arity=2, components=("distance",), plane=(0,), constants=1)

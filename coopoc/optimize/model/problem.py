@@ -350,9 +350,9 @@ def check_item(item: Factor | Constraint, names: Sequence[str], poses: frozenset
         raise InputError(f"nodes of {item.kind}", names[lacking[0]], allowed, "Name it in Problem(names, poses=[...]).")
 
 
-def index_of(node: Any, place: Mapping[str, int], names: Sequence[str]) -> int:
+def index_of(node: Any, index_of_name: Mapping[str, int], names: Sequence[str]) -> int:
     """Index of a node given by name, which has a place, or index; InputError if there is none."""
-    index = place.get(node) if isinstance(node, str) else node
+    index = index_of_name.get(node) if isinstance(node, str) else node
     if not isinstance(index, int | np.integer) or not 0 <= index < len(names):
         raise no_such_node(node, names)
     return int(index)

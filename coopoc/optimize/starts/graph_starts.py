@@ -143,10 +143,10 @@ def tree(graph: Graph) -> Floats:
     elif len(edges):  # angles add, so that one solve is exact
         turns, _ = averaging(edges.nodes, variance, len(rotation), held)
         rotation = exp(turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))) @ rotation
-    space, seen = Space(d, has_rotation=True), (edges, graph.relative_point)
+    space, kinds = Space(d, has_rotation=True), (edges, graph.relative_point)
     at = space.position(with_points(graph, position, rotation, reached))
-    (i, j), moved = np.concatenate([each.nodes for each in seen]).T, np.concatenate([each.position for each in seen])
-    variance = np.concatenate([position_variance(each.covariance, d) for each in seen])
+    (i, j), moved = np.concatenate([each.nodes for each in kinds]).T, np.concatenate([each.position for each in kinds])
+    variance = np.concatenate([position_variance(each.covariance, d) for each in kinds])
     places, _ = averaging(np.stack([i, j], axis=1), variance, len(at), held)
     return space.join(at + places(at[j] - at[i] - (rotation[i] @ moved[..., None])[..., 0]), rotation)
 
@@ -261,7 +261,7 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     """Fixed poses, those with a prior at that, then each robot's first, and the first of each part that its odometry
     joins."""
     priors, poses = graph.pose_prior, np.flatnonzero(graph.is_pose)
-    roots = [(int(i), graph.position[i], graph.rotation[i]) for i in known(graph) if graph.is_pose[i]]
+    roots = [(int(i), graph.position[i], graph.rotation[i]) for i in anchors(graph) if graph.is_pose[i]]
     roots += [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
     part = parts(len(graph.names), graph.relative_pose.nodes[_own(graph)])[poses]
     _, first, count = np.unique(part, return_index=True, return_counts=True)
@@ -279,14 +279,14 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     return roots
 
 
-def known(graph: Graph) -> Ints:
+def anchors(graph: Graph) -> Ints:
     """Fixed vertices of which the graph has the place."""
     return graph.fixed[np.isfinite(graph.position[graph.fixed]).all(axis=1)]
 
 
 def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
     """Nodes with the points where they are fixed, at their priors, where a pose sees them, or by ranges."""
-    points, still = graph.point_prior, known(graph)
+    points, still = graph.point_prior, anchors(graph)
     position[points.nodes[:, 0]], placed[points.nodes[:, 0]] = points.position, True
     position[still], rotation[still], placed[still] = graph.position[still], graph.rotation[still], True
     for (i, j), at in zip(graph.relative_point.nodes.tolist(), graph.relative_point.position, strict=True):

@@ -131,9 +131,9 @@ def scaled(problem: Problem, x: Floats) -> Floats:
         middle, origin = x[fixed].mean(axis=0), y[anchored].mean(axis=0)
         left, _, right = np.linalg.svd((x[fixed] - middle).T @ (y[anchored] - origin))
         y = (y - origin) @ (left @ right).T + middle
-    found = x.copy()
-    found[placed[~anchored]] = y[~anchored]
-    return found
+    mirrored = x.copy()
+    mirrored[placed[~anchored]] = y[~anchored]
+    return mirrored
 
 
 def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
