@@ -189,18 +189,19 @@ def mark_neighbours(
         marks: (2, N, T) out, 1 where they are far: messages, relative measurements.
     """
     for run in range(len(gnss)):
-        counts = np.zeros((gnss.shape[2], 5), np.int64)
+        counts, gap = np.zeros((gnss.shape[2], 5), np.int64), np.zeros(3)
         for i in range(len(links)):
-            link, t, j = links[i]
-            dx, dy, dz = less(neighbours[run, i], x[run, t])
-            if t < counts[j, 0] or math.isnan(dx):
+            link, t, j, own, message = links[i, 0], links[i, 1], links[i, 2], 0.0, 0.0
+            for c in range(3):
+                gap[c] = neighbours[run, i, c] - x[run, t, c]
+                own += (cov[run, t, c, c] + fix[t, j, 1, c]) / 3.0
+            if t < counts[j, 0] or math.isnan(gap[0]):
                 continue
-            d, a, b = relative[run, link]
-            polar, p, message = direction(dx, dy, dz), cov[run, t], 0.0
-            measured, own = with_std(five(d, a, b), std), (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + fix[t, j, 1].mean()
-            gap, reach = residuals(measured, polar), polar[0] * polar[3]
-            q = gap[0] ** 2 / (measured[5] ** 2 + own) + (gap[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
-            q += (gap[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
+            polar = direction(gap[0], gap[1], gap[2])
+            measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)
+            far, reach = residuals(measured, polar), polar[0] * polar[3]
+            q = far[0] ** 2 / (measured[5] ** 2 + own) + (far[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
+            q += (far[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
             own += std[0] ** 2 + (polar[0] * std[1]) ** 2
             for c in range(3):
                 message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[t, j, 0, c] + fix[t, j, 1, c] + own)
