@@ -114,7 +114,7 @@ def faulty(kind: str) -> Recording:
     [
         ("fixes", "fixes, v0: far from its estimates", "kalman lkf-sa joint cooperative-filter"),
         ("covariances", "covariances, v0: contradicted", "kalman joint cooperative-filter"),
-        ("odometer", "odometer, v0: contradicted", "kalman lkf-sa joint cooperative-filter"),
+        ("odometer", "odometry, v0: ", "kalman lkf-sa joint cooperative-filter"),
         ("messages", "messages, v0 and v3: far from estimates", "joint cooperative-filter"),
         ("relative measurements", "messages, v0 and v3: far from estimates", "joint"),  # which are believed at last
     ],

@@ -72,7 +72,7 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
         columns: (E,) of the vehicles.
         fix: (T, N, 2, 3) m^2, variances of a fix, what is white and what lasts.
         every: steps from one fix to the next, at least.
-        marks: (3, E, T) out, 1 where fixes are far, or else contradict covariances.
+        marks: (2 or more, E, T) out, 1 where fixes are far, or else contradict covariances.
     """
     runs, steps = gnss.shape[:2]
     worst, r, p = np.zeros((runs, len(columns))), np.zeros(3), np.zeros(3)
@@ -107,58 +107,6 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
                         marks[kind, k, i] = 1
                 count, far, mean = 0, 0, 0.0
     return worst
-
-
-@compiled
-def mark_odometers(
-    gnss: Floats,
-    velocity: Floats,
-    columns: Ints,
-    doubtful: Floats,
-    fix: Floats,
-    motion: tuple[float, float, float],
-    every: int,
-    dt: float,
-    marks: Ints,
-) -> None:
-    """Mark where the way between the means of JUDGED_IN_A_ROW fixes and of the next ones is not the odometer's.
-
-    Args:
-        gnss: as of `mark_estimates`; columns, fix, every, marks: too.
-        velocity: (R, T, N, 3) m/s in the same frame.
-        doubtful: (R, E), of those above a third of DOUBT it is looked at.
-        motion: variances of a velocity: relative, what of that lasts, and least (m/s)^2.
-        dt: s.
-    """
-    now, last, moved = np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(3)  # means, and their variances
-    for run in range(len(gnss)):
-        for k in range(len(columns)):
-            count, first, begin, after, square, old = 0, 0, -1, 0, 0.0, 0.0
-            for c in range(3):
-                moved[c] = now[0, c] = now[1, c] = 0.0
-            for t in range(gnss.shape[1] if doubtful[run, k] > DOUBT / 3.0 else 0):
-                slip = 0.0
-                for c in range(3 if t > 0 else 0):
-                    way = dt * velocity[run, t, columns[k], c]
-                    moved[c], square = moved[c] + way, square + way * way
-                if t < after or math.isnan(gnss[run, t, columns[k], 0]):
-                    continue
-                first, count, after, steps = t if count == 0 else first, count + 1, t + every, t - begin
-                for c in range(3):
-                    now[0, c] += (gnss[run, t, columns[k], c] - moved[c]) / JUDGED_IN_A_ROW
-                    now[1, c] += (
-                        fix[t, columns[k], 0, c] / JUDGED_IN_A_ROW + fix[t, columns[k], 1, c]
-                    ) / JUDGED_IN_A_ROW
-                if count < JUDGED_IN_A_ROW:
-                    continue
-                walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
-                for c in range(3):
-                    slip += (now[0, c] - last[0, c]) ** 2 / (now[1, c] + last[1, c] + walk)
-                    for i in range(2):
-                        last[i, c], now[i, c] = now[i, c], 0.0
-                for i in range(max(begin, 0), t + 1 if begin >= 0 and slip > DOUBT else 0):
-                    marks[2, k, i] = 1
-                begin, count, square, old = first, 0, 0.0, square
 
 
 @compiled

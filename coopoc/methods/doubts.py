@@ -4,31 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
-from ..kernels.covariances import DOUBT, JUDGED_IN_A_ROW, mark_estimates, mark_neighbours, mark_odometers
-from ..world.links import stretches
+from ..arrays import Floats, Ints
+from ..kernels.covariances import DOUBT, JUDGED_IN_A_ROW, mark_estimates, mark_neighbours
 from ..world.recording import Recording
 from .noise_model import NoiseModel
+from .odometry_fault import NOTE, failed, faults, when
 
 JUDGED_SECONDS = 1.0
 """Least s between two fixes that are judged together; between two numbers of a neighbour twice as much."""
 DOUBTS = (
     "fixes, {}: far from its estimates; it is lost, or rejects them",
     "covariances, {}: contradicted by fixes",
-    "odometer, {}: contradicted by fixes; it slips, or they jump",
+    f"{NOTE} contradicted by fixes; it fails, or they drift",
 )
 NEIGHBOUR_DOUBTS = "messages, {} and {}: far from estimates", "relative measurements, {} and {}: far from estimates"
-
-
-def when(t: Floats, marked: Bools) -> str:
-    """The first three stretches of marked steps, and how many more there are.
-
-    >>> when(np.arange(4.0), np.array([True, True, False, True]))
-    '(0 to 1, 3 to 3 s)'
-    """
-    times = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in stretches(marked)]
-    more = f", and {len(times) - 3} times more" * (len(times) > 3)
-    return f"({', '.join(times[:3])} s{more})"
 
 
 def doubts(
@@ -38,6 +27,7 @@ def doubts(
     cov: Floats | None = None,
     noise_model: NoiseModel | str = "nominal",
     neighbours: Floats | None = None,
+    told: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Notes on what contradicts the estimates of vehicles in any run, and when.
 
@@ -45,7 +35,7 @@ def doubts(
 
     - fixes all beyond their gate: the filter rejects its receiver, or is lost;
     - fixes whose mean, or mean square, is farther off than chance allows: the covariance is wrong;
-    - fixes that move otherwise than the odometer, beyond chance;
+    - fixes that show that the odometry fails, which the method has not noted yet;
     - messages, or relative measurements, of a neighbour that are all beyond HARD_REJECT_FACTOR gates.
 
     Args:
@@ -55,6 +45,7 @@ def doubts(
         cov: (R, T, E, 3, 3) m^2; None if none is claimed.
         noise_model: of the method; covariances and neighbours are not judged where it states no noise.
         neighbours: (R, L, 3) m as of Track; None for none.
+        told: notes that the track has already.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a",), np.arange(9), np.zeros((9, 1, 3)), np.zeros((9, 1, 3)))
@@ -68,15 +59,14 @@ def doubts(
     fix[1] = fix[1].sum()
     every = max(min(round(JUDGED_SECONDS / recording.dt), steps // JUDGED_IN_A_ROW), 1)
     marks = np.zeros((3, len(egos), steps), int)
-    turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
-    motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
     fixes = np.stack(np.broadcast_arrays(recording.fix_scale**2 * fix[0], fix[1]), axis=2)
     doubtful = mark_estimates(recording.gnss, x, claimed, egos, fixes, every, marks)
     doubtful += DOUBT * (neighbours is not None)
-    if recording.body is None:
-        drive = recording.gnss, recording.velocity, egos, doubtful
-        mark_odometers(*drive, fixes, motion, every, recording.dt, marks)
-        marks[2, recording.motion_extra[:, egos, 0].any(axis=0)] = 0  # without odometry
+    noted = [any(note.startswith(NOTE.format(recording.ids[ego])) for note in told) for ego in columns]
+    looked_at = egos[(doubtful > DOUBT / 3.0).any(axis=0) & ~np.array(noted)]
+    if recording.body is None and len(looked_at):
+        corrections = faults(recording, looked_at, NoiseModel.nominal(sensors))
+        marks[2] = 0 if corrections is None else failed(corrections, recording.dt)[:, egos].T
 
     def add(text: str, marked: Ints, *names: int) -> None:
         if marked.any():

@@ -5,18 +5,31 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..arrays import Bools, Floats, Ints
 from ..kernels.odometry_fault import correct_drives, new_state
+from ..world.links import stretches
 from ..world.recording import Recording
-from .doubts import when
 from .noise_model import NoiseModel, motion_noise
+
+NOTE = "odometry, {}:"
+
+
+def when(t: Floats, marked: Bools) -> str:
+    """The first three stretches of marked steps, and how many more there are.
+
+    >>> when(np.arange(4.0), np.array([True, True, False, True]))
+    '(0 to 1, 3 to 3 s)'
+    """
+    times = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in stretches(marked)]
+    more = f", and {len(times) - 3} times more" * (len(times) > 3)
+    return f"({', '.join(times[:3])} s{more})"
 
 
 def with_odometry(
     recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0
 ) -> tuple[Recording, NoiseModel]:
     """The recording with corrected velocities of vehicles whose odometry fails, and the noise model with the noise of
-    these and a note. Both are returned unchanged where no odometry fails, no noise is stated, or velocities were
-    derived from fixes.
+    these and a note. Both are returned unchanged where there are no `faults`.
 
     Args:
         recording: in the world frame.
@@ -24,10 +37,36 @@ def with_odometry(
         noise_model: of the method.
         fix: factor of the standard deviation of fixes.
     """
-    sensors, links = noise_model.sensors, recording.links
-    if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
-        return recording, noise_model
+    links = recording.links
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+    corrections = faults(recording, columns, noise_model, fix)
+    if corrections is None:
+        return recording, noise_model
+    velocity, extra = recording.velocity.copy(), corrections[..., 2]
+    velocity[..., :2] += corrections[..., :2]
+    notes = [*noise_model.notes]
+    for name, steps in zip(recording.ids, failed(corrections, recording.dt).T, strict=True):
+        if steps.any():
+            notes.append(f"{NOTE.format(name)} fails, or its fixes drift; they correct it {when(recording.t, steps)}")
+    corrected_recording = replace(recording, velocity=velocity)
+    notes.extend(note for note in recording.unlikely if note not in corrected_recording.unlikely)
+    return corrected_recording, replace(noise_model, extra=extra, notes=tuple(notes))
+
+
+def faults(recording: Recording, columns: Ints, noise_model: NoiseModel, fix: float = 1.0) -> Floats | None:
+    """(R, T, N, 3) what corrects the odometry of some columns where fixes show that it fails: velocities east and north
+    m/s, and by how much the variance of a motion is larger m^2. None where no odometry fails, no noise is stated, or
+    velocities were derived from fixes.
+
+    Args:
+        recording: in the world frame.
+        columns: of the vehicles.
+        noise_model: that is assumed.
+        fix: factor of the standard deviation of fixes.
+    """
+    sensors = noise_model.sensors
+    if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
+        return None
     more = recording.motion_extra[:, columns, 0]  # as uncertain at every step: fixes alone show the velocity
     columns = columns[~np.isin(columns, recording.landmarks) & ~((more[0] > 0.0) & (np.ptp(more, axis=0) == 0.0))]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
@@ -35,16 +74,14 @@ def with_odometry(
     variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)
     drives = gnss, velocity, fresh, variance, columns, recording.dt
     if not correct_drives(*drives, np.empty((0, 0, 0, 3))):
-        return recording, noise_model
+        return None
     corrections = np.zeros(velocity.shape)
     correct_drives(*drives, corrections)
-    velocity, extra = velocity.copy(), corrections[..., 2]
-    velocity[..., :2] += corrections[..., :2]
-    notes = [*noise_model.notes]
-    for n in columns.tolist():
-        if (failed := np.asarray((extra[:, :, n] > 0).any(axis=0))).any():
-            text = f"odometry, {recording.ids[n]}: fails, or its fixes drift; they correct it"
-            notes.append(f"{text} {when(recording.t, failed)}")
-    corrected_recording = replace(recording, velocity=velocity)
-    notes.extend(note for note in recording.unlikely if note not in corrected_recording.unlikely)
-    return corrected_recording, replace(noise_model, extra=extra, notes=tuple(notes))
+    return corrections
+
+
+def failed(corrections: Floats, dt: float) -> Bools:
+    """(T, N) when odometry fails in any run: where a correction of `faults` is larger than its deviation, or, of a
+    vehicle in a run in which none is, wherever there is one."""
+    sure = np.square(dt * corrections[..., :2]).sum(axis=-1) > corrections[..., 2]
+    return np.asarray(np.where(sure.any(axis=1, keepdims=True), sure, corrections[..., 2] > 0.0).any(axis=0))

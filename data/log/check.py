@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 
 from coopoc.arrays import Floats
-from coopoc.methods.doubts import when
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.odometry_fault import with_odometry
+from coopoc.methods.odometry_fault import when, with_odometry
 
 from .estimates import (
     BEHIND,
