@@ -27,7 +27,7 @@ def doubts(
     cov: Floats | None = None,
     noise_model: NoiseModel | str = "nominal",
     neighbours: Floats | None = None,
-    told: Sequence[str] = (),
+    earlier: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Notes on what contradicts the estimates of vehicles in any run, and when.
 
@@ -45,7 +45,7 @@ def doubts(
         cov: (R, T, E, 3, 3) m^2; None if none is claimed.
         noise_model: of the method; covariances and neighbours are not judged where it states no noise.
         neighbours: (R, L, 3) m as of Track; None for none.
-        told: notes that the track has already.
+        earlier: notes that the track has already.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a",), np.arange(9), np.zeros((9, 1, 3)), np.zeros((9, 1, 3)))
@@ -62,7 +62,7 @@ def doubts(
     fixes = np.stack(np.broadcast_arrays(recording.fix_scale**2 * fix[0], fix[1]), axis=2)
     doubtful = mark_estimates(recording.gnss, x, claimed, egos, fixes, every, marks)
     doubtful += DOUBT * (neighbours is not None)
-    noted = [any(note.startswith(NOTE.format(recording.ids[ego])) for note in told) for ego in columns]
+    noted = [any(note.startswith(NOTE.format(recording.ids[ego])) for note in earlier) for ego in columns]
     looked_at = egos[(doubtful > DOUBT / 3.0).any(axis=0) & ~np.array(noted)]
     if recording.body is None and len(looked_at):
         corrections = faults(recording, looked_at, NoiseModel.nominal(sensors))

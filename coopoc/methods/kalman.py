@@ -118,7 +118,7 @@ def solo_track(
     if cov is not None:
         np.einsum("...ii->...i", cov)[:] = p
         cov.flags.writeable = False  # so that the Track need not copy it
-    notes = (*notes, *doubts(recording, columns, x, cov, noise_model, told=notes))
+    notes = (*notes, *doubts(recording, columns, x, cov, noise_model, earlier=notes))
     x.flags.writeable = False
     return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
 
