@@ -218,7 +218,7 @@ def pivot(
         columns: column or columns whose values become columns.
         value: the metric.
         where: column -> value or values.
-        caption: under the table; default the metric.
+        caption: of the table; default the metric.
         best: "min", "max" or None, sought among the methods.
         decimals: of numbers.
         intervals: show the ends.
@@ -230,7 +230,11 @@ def pivot(
     summary = results.summary([*down, *across], value, where)
     same = [name for name in down if len(down) > 1 and summary[name].nunique(dropna=False) == 1]
     in_all = [f"{words(name)}: {label(name, summary[name].iloc[0])}." for name in same]  # and no column
-    caption = " ".join([caption or f"{words(value)}: mean and 95 % interval.", *in_all])
+    if intervals:
+        in_all.append("In brackets: 95 % interval.")
+    if best:
+        in_all.append("Bold: the best, and those whose difference from it noise may explain.")
+    caption = " ".join([caption or f"{words(value)}.", *in_all])
     down = [name for name in down if name not in same] or down[:1]
     titles, of = dict[str, None](), dict[tuple[Entry, ...], dict[str, Any]]()
     for row in summary.to_dict("records"):
