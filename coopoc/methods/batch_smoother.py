@@ -89,7 +89,13 @@ class BatchSmoother(Checked):
         note = (f"{lost} of {len(x)} runs did not end at a minimum",) if lost else ()
         received, sent = centre(recording, self.message)
         x, cov = x.take(columns, axis=2), cov.take(columns, axis=2)
-        notes = (*model.notes, NOT_CAUSAL, CENTRE, *note, *doubts(recording, columns, x, cov, model, earlier=model.notes))
+        notes = (
+            *model.notes,
+            NOT_CAUSAL,
+            CENTRE,
+            *note,
+            *doubts(recording, columns, x, cov, model, earlier=model.notes),
+        )
         moved, seconds = (received[:, columns], sent[:, columns]), clock() - began
         return Track(recording.t, tuple(columns), x, cov, *moved, seconds, notes=notes, ids=recording.ids)
 
