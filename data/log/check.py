@@ -9,7 +9,7 @@ import pandas as pd
 
 from coopoc.arrays import Floats
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.odometry_fault import when, with_odometry
+from coopoc.methods.odometry_fault import failed, faults, when
 
 from .estimates import (
     BEHIND,
@@ -120,9 +120,9 @@ def check(log: Log) -> Check:
 def _failing(c: Check) -> dict[str, str]:
     """Vehicles whose odometry fixes correct, and when."""
     rec = c.world
-    extra = with_odometry(rec, range(len(rec.ids)), NoiseModel.nominal(rec.sensors))[1].extra
-    failed = np.zeros((0, 0)) if extra is None else (extra[0] > 0).T
-    return {name: when(rec.t, each) for name, each in zip(rec.ids, failed, strict=False) if each.any()}
+    corrections = faults(rec, np.arange(len(rec.ids)), NoiseModel.nominal(rec.sensors))
+    steps = np.zeros((0, 0)) if corrections is None else failed(corrections, rec.dt).T
+    return {name: when(rec.t, each) for name, each in zip(rec.ids, steps, strict=False) if each.any()}
 
 
 def _without(c: Check, columns: Sequence[int]) -> Check:
