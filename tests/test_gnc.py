@@ -76,7 +76,7 @@ def test_a_group_is_one_hypothesis():
 def test_wrong_loop_closures_are_those_that_gtsam_finds():
     """Poses in the plane, against BetweenFactorPose2 under GncLMOptimizer."""
     rng = np.random.default_rng(4)
-    turn, std = np.repeat([0, 0, 0, np.pi / 2], 1).tolist() * 5, np.array([0.1, 0.1, 0.02])
+    turn, std = [0, 0, 0, np.pi / 2] * 5, np.array([0.1, 0.1, 0.02])
     poses = [gtsam.Pose2(0, 0, 0)]
     for angle in turn:
         poses.append(poses[-1].compose(gtsam.Pose2(2.0, 0, angle)))

@@ -1,13 +1,13 @@
 """Starts that race: mirror images, eased ranges, problems without an x0, robust losses; against SciPy's least squares
 from many starts and from the truth."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from random_graphs import random_graph
 from scipy.optimize import least_squares
+from unseen_graphs import lost, ranged_drives, world
 
 from coopoc.arrays import Floats
 from coopoc.formats.graph import Graph, PoseEdges
@@ -20,10 +20,6 @@ from coopoc.optimize.starts import graph_starts, race
 from coopoc.optimize.starts.graph_starts import tree, walk
 from coopoc.optimize.starts.mirrors import ranges_of
 from coopoc.optimize.starts.windings import rewound
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from random_graphs import random_graph
-from unseen_graphs import lost, ranged_drives, world
 
 
 def scipys(problem: Problem, start: Floats) -> float:
@@ -65,10 +61,7 @@ def test_landmarks_beside_a_plane_are_mirrored(seed):
 
 def beside(graph: Graph) -> list[Solution]:
     """From the truth, and from a start of our own to the graph without it."""
-    problems = (
-        from_graph(graph, start="file"),
-        from_graph(lost(graph)),
-    )
+    problems = from_graph(graph, start="file"), from_graph(lost(graph))
     return [solve(problem, covariance=False) for problem in problems]
 
 
@@ -245,10 +238,8 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
 @pytest.mark.parametrize(("d", "seed"), [(2, 315), (3, 303)])
 def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, backend):
     """Costs that noise may explain lead from there, 49 for 25 and 34 for 21: without a note before."""
-    graph, rng = (
-        random_graph(seed, d, 1, loops=8, landmarks=0, ranges=0, seen=0, turn_std=0.3),
-        np.random.default_rng(0),
-    )
+    graph = random_graph(seed, d, 1, loops=8, landmarks=0, ranges=0, seen=0, turn_std=0.3)
+    rng = np.random.default_rng(0)
     truth = from_graph(graph, "geodesic", start="file")
     far = truth.space.retract(truth.x0, 2 * rng.normal(size=truth.movable.shape) * truth.movable)
     found = solve(replace(truth, x0=far), backend)

@@ -40,7 +40,7 @@ UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
 CLIMBS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """s, or halves of an interval of fixes that is longer, in which heights change where a road climbs."""
-COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
+COURSE = "the heading of {} is the course of the {}, carried on by yaw rates if logged: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
 HOLDS = "fixes that stay while the odometry moves on"
 CLOCKWISE = "yaw rates are anticlockwise, but fixes of {} turn the other way: scale=yaw_rate:-1 mends it"

@@ -110,10 +110,11 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
     """
     cholesky, entries = system.cholesky, system.entries
     cost, gradient, values = system.quadratic(x, "gauss-newton")
-    size, none = float(np.sqrt(gradient @ gradient)), np.full((len(x), *(problem.space.dof,) * 2), np.nan)
-    unknown = Assessment(cost, size, none, np.nan)
+    none = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
     if not (np.isfinite(values).all() and np.isfinite(cost)):
-        return unknown
+        return Assessment(cost, np.inf, none, np.nan)
+    size = float(np.linalg.norm(gradient))
+    unknown = Assessment(cost, size, none, np.nan)
 
     def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
         far = float(np.abs(dx).max(initial=0.0))
@@ -359,9 +360,9 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     if not np.isfinite(truth.cost):
         return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)
     if truth.curved:
-        lost = "which has no covariance, and others may cost as little"
-        what = lost if np.isnan(truth.covariance).all() else "whose covariance is that of the exact Hessian"
-        notes.append(f"J^T J is singular at this minimum, {what}")
+        lost = "there is no covariance, and others may cost as little"
+        what = lost if np.isnan(truth.covariance).all() else "the covariance is that of the exact Hessian"
+        notes.append(f"J^T J is singular here: {what}")
     if truth.active is not None:
         (free, along), exact = truth.active.along.shape, truth.active.exact.shape[1]
         unknowns, pushing = unknowns - free + along, exact - along
