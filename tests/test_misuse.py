@@ -127,6 +127,7 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         ),
         (lambda: replace(TRACK, t=TRACK.t[::-1]), r"t\[1\] = 0.4: must be finite and increase"),
         (lambda: co.NoiseModel("m"), "process_std = None: must be given"),
+        (lambda: co.NoiseModel("m", SENSORS, gnss_std=(0, 1, 1)), r"gnss_std\[0\] = 0.0: must be positive"),
         (lambda: of_track(TRACK, OTHER, co.Kalman().message), "ids and times differ from those that were recorded"),
         (lambda: of_track(TRACK, RECORDING.of_runs([0, 0]), co.Kalman().message), "track = 1 runs: must have 2"),
         (lambda: fix_innovations(TRACK, OTHER), "ids and times differ from those that were recorded"),
@@ -425,6 +426,8 @@ def test_training_refuses_values_from_elsewhere():
     swept(learned.OptimisedKF, {"process_std": (1, 1, 1), "velocity_ratio": (1, 1, 1), "gnss_std": (1, 1, 1)}, wrong)
     few = (None, -1, 1.5, "x", [], *HOSTILE)
     net = learned.NoiseParameters()
+    with refused("seed = 'x'"):
+        learned.NoiseParameters("x")
     fit = {"model": net, "training": client.training, "validation": client.validation, "schedule": schedule, "seed": 0}
     swept(learned.fit, {**fit, "progress": None, "long": None}, few)
     federation = {"model": "okf", "clients": [client], "rounds": 1, "local_epochs": 1, "schedule": schedule, "seed": 0}

@@ -71,8 +71,9 @@ def test_joint_is_best_intersection_is_cautious_and_naive_is_not():
     """The optimum has all cross-covariances; without them estimates are used twice (Julier, Uhlmann, ACC 1997)."""
     fleet = convoy()
     seen = observed(fleet, runs=12)
-    makes = {"joint": {}, "naive": {"fusion": "naive"}, "intersection": {"fusion": "intersection"}}
-    tracks = {name: co.PoseFilter("fleet", **how)(seen, range(5)) for name, how in makes.items()}
+    kinds = ("joint", "naive", "intersection")
+    tracks = {name: co.PoseFilter("fleet", fusion=name)(seen, range(5)) for name in kinds}
+    assert (tracks["naive"].sent_bytes == 200 * 64).all()
     tracks["solo"] = co.PoseFilter("solo")(seen, range(5))
     error = {name: float(co.rt_le(track, fleet).mean()) for name, track in tracks.items()}
     nees = {name: float(co.pose_nees(track, fleet).mean()) for name, track in tracks.items()}

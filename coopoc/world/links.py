@@ -128,8 +128,8 @@ def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
         std: (3,) m, rad, rad.
         min_range: m.
 
-    >>> np.diag(vector_cov(np.array([10.0, 0.0, np.pi / 2]), np.array([1.0, 0.1, 0.1]))).round(6)
-    array([1., 1., 1.])
+    >>> np.diag(vector_cov(np.array([0.5, 0.0, np.pi / 2]), np.array([1.0, 0.2, 0.2]))).round(6)
+    array([1.  , 0.01, 0.01])
     """
     az, inc = relative[..., 1], relative[..., 2]
     d = np.maximum(relative[..., 0], min_range)
