@@ -139,7 +139,7 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
                 error.field,
                 error.value,
                 "must be seconds, or a date as 2024-05-01T12:00:00Z",
-                "Mend the cell, or remove the row; if all are so, convert them by pandas.to_datetime.",
+                "Correct the cell, or remove the row; if all are so, convert them by pandas.to_datetime.",
             ) from None
     _refuse(column_values, column_values.isna().to_numpy(), file, "must be a time")
     if kind == "m":
@@ -295,7 +295,7 @@ def _refuse(cells: "pd.Series[Any]", wrong: Bools, file: str, allowed: str) -> N
             f"{file}: row {cells.index[bad[0]]}, column {cells.name}",
             str(cells.iloc[bad[0]])[:60].strip() or "empty",
             allowed,
-            "Mend the cell, or remove the row: a missing row means that there was no measurement.",
+            "Correct the cell, or remove the row: a missing row means that there was no measurement.",
         )
 
 

@@ -327,7 +327,7 @@ def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
         check_time(table[:, 0], file.name)
         gap = np.diff(table[:, 0], prepend=-np.inf)
         order = f"must {'increase' if strictly else 'not decrease'} in time from line to line"
-        _refuse(file, gap <= 0 if strictly else gap < 0, order, "Mend or remove the stamp that is out of order.")
+        _refuse(file, gap <= 0 if strictly else gap < 0, order, "Correct or remove the stamp that is out of order.")
         angle = f"must have a {form.rpartition(' ')[2]} within a turn (a second), in rad"
         _refuse(file, np.abs(table[:, -1]) > MAX_BEARING_RAD, angle, "Convert degrees to radians.")
     return np.array(table)

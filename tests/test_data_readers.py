@@ -55,7 +55,7 @@ OFFSETS = (("a", 0.0), ("b", 0.05))
 BAD = {
     "missing column": (GOOD.replace(",y,", ",north,", 1), "column y = missing", 'columns={"y"'),
     "missing velocity": ("id,t,x,y,z,vx\na,0,0,0,0,1\n", "column vy = missing", "are needed"),
-    "NaN": (GOOD.replace("a,0.1,1,0,0", "a,0.1,nan,0,0"), "row 3, column x", "Mend the cell"),
+    "NaN": (GOOD.replace("a,0.1,1,0,0", "a,0.1,nan,0,0"), "row 3, column x", "Correct the cell"),
     "text": (GOOD.replace("b,0.2,5,2,0", "b,0.2,5,two,0"), "row 6, column y = two", "finite number"),
     "no id": (GOOD.replace("b,0.1", ",0.1"), "row 4, column id", "name"),
     "twice": (GOOD.replace("a,0.1", "a,0.0"), "row 3, column t", "dt must be > 0"),

@@ -186,7 +186,7 @@ def test_a_known_start_needs_no_compass():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: co.PoseFilter("fleet", assumed=NOISE).start(0.1), "has no stream"),
+        (lambda: co.PoseFilter("fleet", assumed=NOISE).start(0.1), "cannot be streamed"),
         (lambda: co.PoseFilter("solo").start(0.1), "assumed"),
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.0), "dt"),
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1, np.zeros(3)), "begin"),

@@ -253,7 +253,7 @@ def check(graph: Graph, location: Location) -> None:
         wanted |= {f"{field}.{name}": shape for name, shape in shapes(field, d, len(edges)).items()}
     for name, shape in wanted.items():
         if (actual := attrgetter(name)(graph).shape) != shape:
-            raise InputError(name, f"shape {actual}", f"must have shape {shape}", "One row per vertex or edge.")
+            raise InputError(name, f"shape {actual}", f"must have shape {shape}", "Give one row per vertex or edge.")
     _vertices(graph, location)
     for field, edges in kinds.items():
         if len(edges):
@@ -273,7 +273,9 @@ def _vertices(graph: Graph, location: Location) -> None:
             raise InputError(location("names", row), f"vertex {name}", before, "Remove or rename one of them.")
     infinite = np.isinf(np.hstack([graph.position, graph.orientation])).any(axis=1)
     allowed = "must be finite, or NaN where unknown"
-    _refuse(location, "names", infinite, [f"vertex {name} at infinity" for name in names], allowed, "Mend the number.")
+    _refuse(
+        location, "names", infinite, [f"vertex {name} at infinity" for name in names], allowed, "Correct the number."
+    )
     timed = [f"stamp {stamp} of {name}" for stamp, name in zip(graph.stamps, names, strict=True)]
     wrong = np.isfinite(graph.stamps) & ~graph.is_pose
     _refuse(location, "names", wrong, timed, "must be NaN: a point has none", "Give stamps to poses only.")
@@ -308,7 +310,7 @@ def _values(edges: Edges, field: str, location: Location) -> None:
     """
     for name in [n for n in shapes(field, 2, 0) if n not in ("nodes", "stamps")]:
         values: Floats = getattr(edges, name).reshape(len(edges), -1)
-        mend, actual = "Mend the number.", f"{name} "
+        mend, actual = "Correct the number.", f"{name} "
         _refuse(location, field, ~np.isfinite(values).all(axis=1), values, "must be finite", mend, actual)
         if name in ("distance", "variance"):
             _refuse(

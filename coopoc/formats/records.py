@@ -234,4 +234,4 @@ def _find(location: str, word: str, role: str, index: Index) -> int:
         raise InputError(location, f"vertex {word}", "is both a pose and a point", "Give every vertex its own id.")
     other = any(word in names for names in index.values())
     allowed = f"must be a {role}" if other else "must be one of the vertices of the file"
-    raise InputError(location, f"vertex {word}", allowed, "Check the order." if other else "Add its VERTEX line.")
+    raise InputError(location, f"vertex {word}", allowed, "Check their order." if other else "Add its VERTEX line.")

@@ -71,7 +71,9 @@ def malformed(file: str, line: int, words: Sequence[str], form: str) -> InputErr
     """The error of a line that does not have its form."""
     shown = " ".join(word if len(word) <= 40 else f"{word[:40]}..." for word in words[:40])
     actual = f"{shown}{' ...' if len(words) > 40 else ''} ({len(words)} words)"
-    return InputError(f"{file}: line {line}", actual, f"must be {form}, all finite numbers", "Mend or remove the line.")
+    return InputError(
+        f"{file}: line {line}", actual, f"must be {form}, all finite numbers", "Correct or remove the line."
+    )
 
 
 def read_table(path: Path, form: str) -> tuple[Ints, Floats]:

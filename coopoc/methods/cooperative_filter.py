@@ -186,9 +186,7 @@ class CooperativeFilter(Checked):
         check_fields(self)
         for name, value in self.priors._asdict().items():
             least = -np.inf if name in ("absent", "exact") else 0.0
-            number(
-                f"priors.{name}", value, least, allowed="a number, not negative", hint="Give Priors()._replace(...)."
-            )
+            number(f"priors.{name}", value, least, allowed=">= 0", hint="Give Priors()._replace(...).")
 
     @property
     def message(self) -> Message:

@@ -39,7 +39,7 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
             return noted(call(self, recording, egos))
         for column, pieces in cuts.items():
             if not pieces:
-                never = "is never there at two steps in a row, with a fix"
+                never = "is never present at two successive steps with a fix"
                 raise InputError("egos", repr(recording.ids[column]), never, "Choose another ego.")
         parts = {
             (column, cut): call(_from(self, cut[0]), recording.between(*cut), [recording.ids[column]])

@@ -18,7 +18,7 @@ class MotionHistory:
 
     def __init__(self, span: float) -> None:
         self.rows: Floats = np.zeros((65, 7))
-        self.rows[0, 3], self.rows[0, SQUARE] = seconds("history", span), np.nan
+        self.rows[0, 3], self.rows[0, SQUARE] = number("history", span), np.nan
 
     def __len__(self) -> int:
         return int(self.rows[0, 1])
@@ -112,12 +112,6 @@ def relative_vector(value: npt.ArrayLike) -> Floats:
         raise InputError("relative", shown(value), text, "Give NaN for what was not measured.")
     radians("relative angles", relative[1:])
     return relative
-
-
-def seconds(field: str, value: float) -> float:
-    """A time that is finite and >= 0; InputError naming the field if it is not."""
-    checked: float = number(field, value, hint="Give seconds.")
-    return checked
 
 
 def numbers(value: npt.ArrayLike) -> Floats:

@@ -60,13 +60,19 @@ class NoiseModel:
             hint = "Give process_std=(1.0, 1.0, 1.0), or sensors=Sensors(), whose noise follows the speed."
             raise InputError("process_std", None, "must be given where there are no sensors", hint)
         compass = checked("compass", self.compass, "(2,)", (2,))
-        refuse("compass", compass, ~((compass >= 0) & (compass <= np.pi)), "must be in 0..pi rad", "Use np.deg2rad.")
+        refuse(
+            "compass",
+            compass,
+            ~((compass >= 0) & (compass <= np.pi)),
+            "must be in 0..pi rad",
+            "Convert degrees by np.deg2rad.",
+        )
         self.__dict__["compass"] = tuple(compass.tolist())
         for field in ("process_std", "gnss_std"):
             if field == "gnss_std" or self.process_std is not None:
                 value = checked(field, getattr(self, field), "(3,)", (3,))
                 wrong = ~(np.isfinite(value) & (value > 0))
-                refuse(field, value, wrong, "must be positive and finite", "Assumed noise may not be zero.")
+                refuse(field, value, wrong, "must be positive and finite", "Give standard deviations above zero.")
                 self.__dict__[field] = tuple(value.tolist())
 
     @classmethod

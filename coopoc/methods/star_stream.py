@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints, instance, refuse
+from ..arrays import Floats, Ints, instance, number, refuse
 from ..errors import InputError, shown
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.geometry import components
@@ -34,7 +34,7 @@ from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_st
 from ..world.links import drop_steep_azimuths
 from ..world.plausible import MAX_POSITION, MAX_SPEED
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
-from .motion_history import MotionHistory, fix_or_none, relative_vector, seconds, three
+from .motion_history import MotionHistory, fix_or_none, relative_vector, three
 from .noise_model import constant_noise, motion_noise
 
 START_VARIANCE = 0.01
@@ -74,7 +74,7 @@ class RelativeMeasurement:
         relative = relative_vector(self.relative)
         row[:AGE], row[AGE] = (
             components(drop_steep_azimuths(relative)[None, None], np.zeros(1, np.int64))[0, 0],
-            seconds("age", self.age),
+            number("age", self.age),
         )
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
@@ -150,7 +150,7 @@ class StarStream:
         self._filter, self._tries = make_filter(1, 1)
         self._motion: MotionNoise = motion_noise(noise_model, interval)
         self._fix = priors.fix**2 * np.array(noise_model.gnss_variance)
-        self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
+        self.max_age, self.history = number("max_age", max_age), MotionHistory(history)
         self._given, self._time = np.zeros(8), 0.0
         self._numbers, self._names = dict[str, int](), list[str]()
         self._last: Floats = np.full((1, WIDTH), np.nan)

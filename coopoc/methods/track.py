@@ -148,7 +148,7 @@ class Track:
 
 def of_recording(track: Track, recording: Recording) -> None:
     """InputError unless a track is one of this recording: of its runs, times and vehicles."""
-    recording = instance("recording", recording, Recording, "The track stands before its recording.")
+    recording = instance("recording", recording, Recording, "Give the track first, then its recording.")
     same_drive(recording, instance("track", track, Track).ids or recording.ids, track.t)
     columns("egos", track.egos, recording.ids)
     if len(track.x) != recording.runs:

@@ -88,7 +88,7 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
             f"{row_of(early)}, column arrival",
             f"{early['arrival'].iloc[0]:.6f} s, sent at {early['t'].iloc[0]:.6f} s",
             "must not come before the message was sent",
-            'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.',
+            'Give the offsets of the clocks, as clock={"car2": 0.35}, or correct the row.',
         )
     return rows
 

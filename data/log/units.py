@@ -182,7 +182,7 @@ def check_values(rows: Rows) -> None:
         (value < kind.map(LEAST_VALUES), "{kind}", value, "must be >= 0", "Remove the row."),
         (rows["std"] <= 0, deviation, rows["std"], "must be > 0", "Leave it empty where it is unknown."),
         (alone, "column partner", partner, "must be a name", "Name the vehicle or road-side unit."),
-        (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),
+        (partner == rows["vehicle"], "column partner", partner, ITSELF, "Correct or remove the row."),
     ):
         if wrong.any():
             first, cell = kind[wrong].iloc[0], actual[wrong].iloc[0]

@@ -101,8 +101,10 @@ class PoseFilter:
         check_fields(self)
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
-        number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
-        refuse("spread", self._spread, ~(self._spread > 0), "must be > 0", "Give m, m, m and rad.")
+        number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="A gate of 4 rejects outliers.")
+        refuse(
+            "spread", self._spread, ~(self._spread > 0), "must be > 0", "Give standard deviations in m, m, m and rad."
+        )
         if not self.name:
             self.__dict__["name"] = f"pose-{self.unit if self.fusion == 'joint' else self.fusion}"
 
@@ -137,7 +139,12 @@ class PoseFilter:
         columns, links, notes = recording.observing(egos), recording.links, tuple[str, ...]()
         for column in columns:
             if column in recording.landmarks:
-                raise InputError("egos", repr(recording.ids[column]), "is a landmark", "Its position is known.")
+                raise InputError(
+                    "egos",
+                    repr(recording.ids[column]),
+                    "is a landmark",
+                    "Choose a vehicle: the position of a landmark is known.",
+                )
         received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
             begin = self.begins(recording, columns)
@@ -214,7 +221,7 @@ class PoseFilter:
         [1.0, 2.0, 0.0, 0.5]
         """
         if self.unit == "fleet":
-            raise InputError("unit", self.unit, "has no stream", 'Take "solo".')
+            raise InputError("unit", self.unit, "cannot be streamed", 'Take "solo".')
         if self.assumed is None:
             raise InputError("assumed", None, "is needed: a stream has no recording", "Give assumed=Sensors(...).")
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")

@@ -66,7 +66,10 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
     begin_poses = np.full(shape[1:], np.nan) if begin is None else checked("begin", begin)
     if begin_poses.shape not in (shape, shape[1:]):
         raise InputError(
-            "begin", f"shape {begin_poses.shape}", f"must have shape {shape[1:]} or {shape}", "One pose each."
+            "begin",
+            f"shape {begin_poses.shape}",
+            f"must have shape {shape[1:]} or {shape}",
+            "Give one pose per vehicle.",
         )
     radians("headings of begin", begin_poses[..., 3])
     poses = np.ascontiguousarray(np.broadcast_to(begin_poses, shape))

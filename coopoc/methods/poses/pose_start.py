@@ -153,7 +153,9 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
         and (places[complete] == places[complete[0]]).all()
     ):
         actual = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
-        raise InputError("seconds", actual, "must hold a second place", "Take more seconds, or give its pose.")
+        raise InputError(
+            "seconds", actual, "must include a second landmark or a fix", "Take more seconds, or give its pose."
+        )
     if len(fixes):
         step = fixes[:1]
         at, offset = recording.gnss[0, step, column], way[step]

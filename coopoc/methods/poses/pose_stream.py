@@ -42,7 +42,9 @@ class OwnMeasurement:
         heading = np.nan
         if self.heading is not None and not (isinstance(self.heading, float) and np.isnan(self.heading)):
             heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
-        rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
+        rate = number(
+            "yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Give 0 for a vehicle that stands."
+        )
         radians("heading", np.array(heading), UNWRAPPED)
         radians("yaw_rate", np.array(rate), MAX_YAW_RATE)
         moving = three("velocity", self.velocity, MAX_SPEED)
