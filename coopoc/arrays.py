@@ -213,6 +213,17 @@ def one_of(noun: str, name: object, known: Any) -> str:
     return name
 
 
+def last_true(flags: npt.ArrayLike, axis: int = 0) -> Ints:
+    """Index along an axis of the last True until there, -1 before the first.
+
+    >>> last_true(np.array([False, True, False])).tolist()
+    [-1, 1, 1]
+    """
+    shape = np.shape(flags)
+    index = np.arange(shape[axis]).reshape(-1, *(1,) * (len(shape) - 1 - axis))
+    return np.maximum.accumulate(np.where(flags, index, -1), axis)
+
+
 def robust_std(values: Floats) -> float:
     """1.4826 median(|v - median(v)|), the standard deviation of a Gaussian without its outliers (MAD).
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from coopoc import V2X, Fleet, Method, Recording, observe
-from coopoc.arrays import AnyArray, Floats
+from coopoc.arrays import AnyArray, Floats, last_true
 from coopoc.study.study import Row
 from coopoc.world.recording import NOTHING_SIMULATED
 
@@ -78,7 +78,7 @@ def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
 def _ratio(measured: AnyArray, true: AnyArray, slow: float) -> AnyArray:
     """(T,) complex factor of the odometry's motion over the true one, as before where the vehicle is slow."""
     fast = (np.abs(true) > slow) & np.isfinite(measured)
-    last = np.maximum.accumulate(np.where(fast, np.arange(len(true)), np.argmax(fast)))
+    last = np.maximum(last_true(fast), np.argmax(fast))
     last_ratio = (np.where(fast, measured, 1.0) / np.where(fast, true, 1.0))[last]
     ratio: AnyArray = np.clip(np.abs(last_ratio), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(last_ratio), -0.5, 0.5))
     return ratio

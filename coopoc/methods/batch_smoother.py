@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, last_true
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE, HARD_REJECT_FACTOR
@@ -190,8 +190,7 @@ def located(recording: Recording) -> Bools:
     A vehicle that has no fix yet has no position to linearise at: until then it takes no part.
     """
     present = np.isfinite(recording.velocity[0, :, :, 0])
-    step = np.arange(len(present))[:, None]
     before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
-    joined = np.maximum.accumulate(np.where(present & ~before, step, -1))
-    fix = np.maximum.accumulate(np.where(np.isfinite(recording.gnss).all(axis=-1), step, -1), axis=1)
+    joined = last_true(present & ~before)
+    fix = last_true(np.isfinite(recording.gnss).all(axis=-1), axis=1)
     return present & (fix >= joined)

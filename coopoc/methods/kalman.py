@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import Floats, last_true
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE
@@ -36,7 +36,7 @@ class GNSS(Alone):
         columns = check_recording(recording).columns(egos)
         fixes = recording.gnss[:, :, columns]
         there = np.isfinite(fixes).all(axis=-1, keepdims=True)
-        newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)
+        newest = last_true(there, axis=1).clip(0)
         x, missing = np.take_along_axis(fixes, newest, axis=1), 100 * (1 - there.mean())
         notes = (f"holds the last fix where there is none: {missing:.0f} % of the steps",) if missing else ()
         variance = np.broadcast_to(np.square(recording.sensors.gnss_std * recording.fix_scale[:, columns]), x.shape)

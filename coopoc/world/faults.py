@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, last_true
 from .fleet import Fleet
 from .links import Links, spherical, wrap
 from .outliers import Fault, Outliers
@@ -46,7 +46,7 @@ def episodes(fault: Fault, key: tuple[int, str, int, str, str], steps: int, dt: 
     draws = stream(*key).random((steps, 5))
     fresh = draws[:, 0] >= (np.exp(-dt / fault.lasts) if fault.lasts else 0.0)
     fresh[:1] = True
-    held = draws[np.maximum.accumulate(np.where(fresh, np.arange(steps), 0))]
+    held = draws[last_true(fresh)]
     low, high = fault.size
     share = -np.log1p(-held[:, 2]) if fault.law == "exponential" else held[:, 2]
     return Episodes(held[:, 1] < fault.rate, low + (high - low) * share, held[:, 3:])

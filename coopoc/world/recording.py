@@ -7,7 +7,21 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import TINY, Bools, Floats, Ints, checked, instance, listed, number, plain, refuse, remade, texts
+from ..arrays import (
+    TINY,
+    Bools,
+    Floats,
+    Ints,
+    checked,
+    instance,
+    last_true,
+    listed,
+    number,
+    plain,
+    refuse,
+    remade,
+    texts,
+)
 from ..errors import InputError
 from ..text import short_repr
 from .fleet import check_steps, clock, columns, interval, names
@@ -409,8 +423,7 @@ def _contradicting(recording: Recording) -> float:
     if body is not None:
         heading, turned = body.heading[0], np.cumsum(np.nan_to_num(body.yaw_rate[0]), axis=0) * recording.dt
     path = np.cumsum(np.nan_to_num(u * np.exp(1j * turned)), axis=0) * recording.dt
-    steps = np.where(np.isfinite(fixes), np.arange(len(u))[:, None], -1)
-    newest, column = np.maximum.accumulate(steps, axis=0)[::lag], np.arange(u.shape[1])
+    newest, column = last_true(np.isfinite(fixes))[::lag], np.arange(u.shape[1])
     ends = (values[newest, column] for values in (fixes, path, np.cumsum(np.isnan(u), axis=0)))
     moved, driven, gaps = (np.diff(values, axis=0) for values in ends)
     turn = np.exp(1j * (heading - turned))[newest[:-1], column]

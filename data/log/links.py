@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc import V2X, Links, Recording, Sensors
-from coopoc.arrays import Bools, Floats, Ints, runs_in_memory
+from coopoc.arrays import Bools, Floats, Ints, last_true, runs_in_memory
 from coopoc.world.links import spherical, wrap
 from coopoc.world.sensing import schedule
 
@@ -210,8 +210,7 @@ def _to_step(
     if steps.body:
         value = np.where(component == 1, value + lag * during(rate, observer), value)
     path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
-    fixed = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
-    last = np.maximum.accumulate(fixed, axis=0)
+    last = last_true(np.isfinite(fixes[..., 0]))
     position = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
     now = position[step, neighbour] - position[step, observer]
     then = now + lag[:, None] * (during(velocity, neighbour) - during(velocity, observer))

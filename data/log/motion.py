@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc import InputError, Sensors
-from coopoc.arrays import Bools, Floats, Ints, checked
+from coopoc.arrays import Bools, Floats, Ints, checked, last_true
 from coopoc.kernels.constant_velocity import BANK, REMEMBERS, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
@@ -393,8 +393,8 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     velocity, growth, spread, proved = constant_velocity(
         fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
     )
-    sure, order = np.isfinite(growth), np.arange(len(growth))
-    since = order - np.maximum.accumulate(np.where(sure, 0, order))
+    sure = np.isfinite(growth)
+    since = np.arange(len(growth)) - last_true(~sure)
     begun = since > 1  # two fixes show no change
     learned = begun & (fixes.t > fixes.t[0] + REMEMBERS)
     grown = (growth * np.maximum(proved, variance))[learned if learned.any() else begun]
@@ -434,7 +434,7 @@ def _held(fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bo
     nearest, _ = steps.nearest(fixes.t)
     moves = there & (np.linalg.norm(velocity, axis=1) > STANDS)
     way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
-    before = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
+    before = last_true(~again)
     return np.asarray(again & there[nearest] & (np.linalg.norm(way - way[before], axis=1) > std))
 
 
