@@ -221,6 +221,7 @@ def test_unknown_and_unrecorded_egos(crossing):
     with refused("egos"):
         recording.columns(["ghost"])
     assert recording.columns(["c2", 1]) == [2, 1]
+    assert np.array_equal(recording.between(0, len(recording.t)).arrival, recording.arrival)
 
 
 @pytest.mark.parametrize(("seed", "run"), [(0, 0), (7, 99), (2**32 - 1, 3), (2**32, 2)])
