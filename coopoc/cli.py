@@ -76,7 +76,7 @@ def run(
 
     chosen = [] if data is None else [f"data={data}"]
     changes = assignments([*chosen, *(text for group in set for text in group)])
-    study = find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
+    study = find_study(name).override(changes)  # a mistake is reported before pandas and Arrow are imported
     for first in points(study)[:1]:
         study.key({**study.settings, **first})
     if tracks == "tum":

@@ -190,7 +190,7 @@ ROBUSTNESS = study(
     (KALMAN, NET, LKF, JOINT, SPLIT, COOPERATIVE, BOUND),
     "Long ranges: 3 to 20 m, each by itself or for 2 s of a pair; wild fixes: 10 to 50 m off, of every vehicle; slip: "
     "speeds wrong by 20 to 100 % of themselves, for 0.5 s; spoofed: fixes 5 to 40 m off on each axis, of vehicles "
-    "that are no egos. Methods assume none of it; the bound is that of an estimator which is told what is wrong.",
+    "that are no egos. Methods assume none of it; the bound is that of an estimator without the wrong measurements.",
     list(WRONG),
     settings={**scene.TOWN, **scene.WEIGHTS, "max_neighbours": 6, "runs": 10, "train_seeds": 1},
     limitations=(

@@ -186,7 +186,7 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
 def bound_rows(p: Params) -> list[Row]:
     """The bound of each ego over an ideal channel, with the bytes that the ego would receive.
 
-    It needs no draws but where there are outliers or an attack: then it is that of an estimator which is told of them,
+    It needs no draws but where there are outliers or an attack: then it is that of an estimator that knows of them,
     the mean over runs. Newcomers bring their past, unless the noise model is that of BOUND or "star". Real data have
     none: the bound is of sensors that measure at every step.
     """

@@ -276,7 +276,7 @@ def recording(p: Params, remove_outliers: bool = False) -> Recording:
 
     Args:
         p: parameters of the cell.
-        remove_outliers: leave out outliers and false fixes, as an estimator does which is told of them.
+        remove_outliers: leave out outliers and false fixes, as an estimator that knows of them would.
     """
     from coopoc.methods.catalogue import needs_whole_fleet
 

@@ -124,7 +124,7 @@ def bound(task: Task, information: str) -> float:
     """RT-LE m of the bound over an ideal channel, root mean square over the egos: no method is below it.
 
     Args:
-        task: its drive and noise; a bias is left out, and of outliers and an attack the estimator is told.
+        task: its drive and noise; a bias is left out, and the estimator knows of outliers and an attack.
         information: "solo", "star", "past" (a star with the past of newcomers) or "fleet".
     """
     fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))

@@ -46,7 +46,7 @@ class Scene:
         return replace(self, edits=(*self.edits, edit))
 
     def sensing(self, stated: bool = False, **more: Any) -> "Scene":
-        """The same with other sensors, of which methods are told or not."""
+        """The same with other sensors, whose noise methods assume, if `stated`."""
         assumed = replace(self.assumed, **more) if stated else self.assumed
         return replace(self, acting=replace(self.acting, **more), assumed=assumed)
 

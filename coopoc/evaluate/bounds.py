@@ -49,7 +49,8 @@ def posterior_bound(
     velocities of the linked neighbours over an ideal channel (star); a vehicle that leaves the star is forgotten, as
     its motion is not received. The bias is left out: it is unobservable from a GNSS start. Drift and common errors of
     the fixes are unknowns beside the positions (filtering only). Outliers are not in the sensors' information: under
-    outliers and attacks the bound is that of an estimator which is told of them, from a `recording` without them.
+    outliers and attacks the bound is that of an estimator without the wrong measurements: give a `recording` that
+    lacks them.
 
     Args:
         fleet: truth.
@@ -58,7 +59,7 @@ def posterior_bound(
         v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
         past: the bound of an ego that also knows the fixes and velocities of neighbours from before they joined its
-            star, as messages with sums since departure tell it. It is never above the star's bound, and equal to it
+            star, as messages with sums since departure convey them. It is never above the star's bound, and equal to it
             while the same neighbours stay.
         recording: of this drive, such as `observe(..., remove_outliers=True)`: a fix, a range or an angle that it lacks
             (NaN) is not measured, and the bound is the mean over its runs. Default: all is measured.

@@ -154,7 +154,7 @@ class Graph:
         pose_prior: measured poses.
         point_prior: measured points.
         fixed: (F,) places in names of the vertices that stay where they are (g2o's FIX).
-        guess: the vertices are an initial guess, as in g2o, from which a solve may begin without being told.
+        guess: the vertices are an initial guess, as in g2o, from which a solve begins by default.
         notes: what the reader changed, such as noise that it repaired.
         location: (field, row) -> where it came from, for messages; readers pass the line of the file.
 

@@ -110,8 +110,8 @@ def curves(
 ) -> Plot | None:
     """Plot a number of selections over a parameter, in panels that share the vertical axis; None if none was run.
 
-    The selection of a point is that of its panel, its place and its line, where the later name wins. Lines are told
-    apart by method; their style shows the noise model where they have several.
+    The selection of a point is that of its panel, its place and its line, where the later name wins. Lines differ
+    by method; their style shows the noise model where they have several.
 
     Args:
         results: of the study.

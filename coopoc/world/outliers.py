@@ -37,7 +37,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Outliers:
-    """What goes wrong beyond noise; by default nothing. Methods are not told of it.
+    """What goes wrong beyond noise; by default nothing. Methods do not know of it.
 
     >>> Outliers(ranges=Fault(0.05, (3.0, 20.0))).notes
     ('5 % of the ranges 3 to 20 m too long',)

@@ -76,7 +76,7 @@ def spoofed(
         attack: or its share alone.
         seed: of the attack.
         honest: columns or ids of egos that are never spoofed.
-        remove_outliers: whether false fixes are missing (NaN) instead, as for an estimator which is told of the attack.
+        remove_outliers: whether false fixes are missing (NaN) instead, as for an estimator that knows of the attack.
 
     Raises:
         InputError: a share outside [0, 1], seed < 0, an honest vehicle that is none of the recording.

@@ -132,7 +132,7 @@ def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: 
 
 
 LINE_WIDTH, RANGE_SECONDS = 0.1, 5.0
-"""m: ranges to places this near to one line do not tell on which side of it the vehicle is; s for which ranges count
+"""m: ranges to places this near to one line do not show on which side of it the vehicle is; s for which ranges count
 after the first one to the last place."""
 
 
