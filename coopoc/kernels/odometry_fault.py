@@ -37,7 +37,7 @@ WALK, ANEW, SHARE, RATE, STDS, DURATION, SIZE = range(33, 40)
 PACES = ((0.001, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 0.2, 0.5, 5.0, 2.0))
 """Of the random walks of b: the density of its acceleration m^2/s^3; the evidence that its filter loses where it begins
 anew; and the least error of an odometry that fails, as a share of the way, in m for each second, and in standard
-deviations of a fix, and for how many s it lasts."""
+deviations of a fix, MAX_WANDER_M at most, and for how many s it lasts."""
 AVERAGED_FIXES_S = 0.4
 """s, interval whose fixes are averaged into one."""
 RESTART_Q, MAX_Q = 14.0, 25.0
@@ -46,8 +46,9 @@ DECISIVE, MAX_EVIDENCE = 15.0, 18.0
 """Evidence, a log likelihood ratio, from which the odometry fails, and the most that is counted."""
 FASTER = 4.0
 """Times the fastest by odometry that a vehicle may go, if that is above RATE: m/s for km/h make it 3.6."""
-WANDERS = 2.0
-"""s, in which the errors of all fixes may change together."""
+WANDERS, MAX_WANDER_M = 2.0, 100.0
+"""s, in which the errors of all fixes may change together, and m, farther than which these do not wander, however noisy
+fixes are."""
 NOISIER, UNKNOWN = 0.1, 4.0
 """Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
 for at first, and that of odometry all the time."""
@@ -145,7 +146,7 @@ def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
         return 0.0
     gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
-    least = max(state[SHARE] * state[PATH], state[RATE] * state[LASTS], state[STDS] * math.sqrt(r))
+    least = max(state[SHARE] * state[PATH], state[RATE] * state[LASTS], min(state[STDS] * math.sqrt(r), MAX_WANDER_M))
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0
