@@ -4,6 +4,7 @@ Run:  python benchmarks/graphs.py                            (every PyFG file in
       python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
       python benchmarks/graphs.py folder --hard              (any folder of PyFG and g2o files, with hard variants)
       python benchmarks/graphs.py --unseen 1                 (kinds of graphs that no file holds; so many seeds)
+      python benchmarks/graphs.py --sizes                    (how time grows with them)
 
 GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
 as it comes, from chained odometry. It has no factor for a landmark's position in a pose's frame with our weights, so
@@ -15,7 +16,7 @@ import argparse
 import os
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -24,7 +25,7 @@ import gtsam
 import numpy as np
 from hard_graphs import VARIANTS
 from tabulate import tabulate
-from unseen_graphs import FAMILIES, alignment_error
+from unseen_graphs import FAMILIES, SIZES, alignment_error
 
 from coopoc.errors import InputError
 from coopoc.formats import GRAPHS, load_graph
@@ -105,10 +106,10 @@ def row(name: str, graph: Graph) -> list[object]:
     return [*cells, problem.cost(x), iterations, time.process_time() - began, error(graph, x[:, : graph.dimension])]
 
 
-def unseen(seeds: int = 3) -> Iterator[list[object]]:
+def unseen(families: dict[str, Callable[[int], Graph]], seeds: int) -> Iterator[list[object]]:
     """A row per family and seed."""
     row("warm", FAMILIES["marine"](0))
-    for name, make in FAMILIES.items():
+    for name, make in families.items():
         for seed in range(seeds):
             yield row(f"{name}, seed {seed}", make(seed))
 
@@ -144,9 +145,10 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="files, without their suffixes; all of them by default")
     parser.add_argument("--hard", action="store_true", help="worse variants of each file, too")
     parser.add_argument("--unseen", type=int, metavar="SEEDS", help="graphs that no file holds, of so many seeds")
+    parser.add_argument("--sizes", action="store_true", help="the same of growing size")
     given = parser.parse_args()
-    if given.unseen:
-        found = list(unseen(given.unseen))
+    if given.unseen or given.sizes:
+        found = list(unseen(SIZES if given.sizes else FAMILIES, given.unseen or 1))
     elif not given.folder.is_dir():
         parser.error(f"no folder {given.folder}")
     else:

@@ -254,15 +254,27 @@ def round_surface(shape: str, rings: int, around: int, turn: float) -> Callable[
     return made
 
 
-def manhattan(factor: float, wrong: float = 0.0) -> Callable[[int], Graph]:
+def manhattan(factor: float, wrong: float = 0.0, steps: int = 3500) -> Callable[[int], Graph]:
     """Streets, loops where the drive crosses itself, odometry `factor` times as bad, a share `wrong` of loops that are
     outliers."""
 
     def made(seed: int) -> Graph:
-        w = blocks(seed, 3500)
-        edges = joined(w.relative(w.chain(), 0.02, 0.01), w.relative(w.near(2000, 1.5), 0.02, 0.01, wrong))
+        w = blocks(seed, steps, int(20 * (steps / 3500) ** 0.5))
+        edges = joined(w.relative(w.chain(), 0.02, 0.01), w.relative(w.near(4 * steps // 7, 1.5), 0.02, 0.01, wrong))
         graph = w.graph(relative_pose=edges)
         return worse_odometry(graph, factor) if factor > 1 else graph
+
+    return made
+
+
+def random_ranges(steps: int) -> Callable[[int], Graph]:
+    """Bad odometry, and twice as many ranges as poses between any of them."""
+
+    def made(seed: int) -> Graph:
+        w = world(seed, 2, 1, steps)
+        pairs = np.sort(w.rng.integers(0, steps, (2 * steps, 2)), axis=1)
+        ranges = w.ranged(pairs[pairs[:, 1] - pairs[:, 0] > 1], 0.1)
+        return w.graph(relative_pose=w.relative(w.chain(), 0.1, 0.05), ranges=ranges)
 
     return made
 
@@ -331,6 +343,15 @@ FAMILIES: dict[str, Callable[[int], Graph]] = {
     "seen once": seen_once,
 }
 """Name -> seed -> graph."""
+SIZES: dict[str, Callable[[int], Graph]] = {
+    "random ranges 1500": random_ranges(1500),
+    "random ranges 3300": random_ranges(3300),
+    "Manhattan 10000": manhattan(1.0, steps=10_000),
+    "Manhattan 30000": manhattan(1.0, steps=30_000),
+    "Manhattan 100000": manhattan(1.0, steps=100_000),
+    "sphere 2200, turns of 0.3": round_surface("sphere", 44, 50, 0.3),
+}
+"""The same, by size."""
 
 
 def ranged_drives(seed: int) -> Graph:
