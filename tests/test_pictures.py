@@ -48,6 +48,7 @@ def test_an_ellipse_holds_95_percent():
 def test_a_recording_shows_its_fixes_and_links(seen):
     _fleet, recording = seen
     ax = co.plot_recording(recording, run=1, step=20)
+    assert not ax.spines["top"].get_visible()
     assert_array_equal(ax.lines[7].get_xydata(), recording.gnss[1, :, 7, :2])
     (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
     assert len(lines.get_segments()) == int((recording.links.step == 20).sum()) > 0
