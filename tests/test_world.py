@@ -215,7 +215,7 @@ def test_recording_holds_no_truth(crossing):
 
 
 def test_unknown_and_unrecorded_egos(crossing):
-    recording = observe(crossing, S2, observers=[1, 2])
+    recording = observe(crossing, S2, V2X(loss=0.5), observers=[1, 2])
     with refused("observers"):
         recording.columns([0])
     with refused("egos"):
