@@ -2,23 +2,13 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import arg
 
-from coopoc.plugins import find
-
-if TYPE_CHECKING:
-    from coopoc import Results
-
-PAPER_STUDIES: Mapping[str, tuple[str, ...]] = {
-    "convergence": ("centralised",),
-    "error_cdf": ("scenario 1", "scenario 2"),
-    "neighbours": ("nominal",),
-}
-"""Studies of the paper, and the keys of the findings that answer their questions."""
+PAPER_STUDIES = ("neighbours", "convergence", "error_cdf")
+"""Studies of the paper, that which answers the question of the page first."""
 LEAD = "After “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on {where}."
 
 
@@ -36,34 +26,24 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
-    from coopoc import Results, run_study
+    from coopoc import run_study
     from coopoc.data.registry import DATASETS, card, in_words
     from coopoc.study.report import report
 
-    began, results, inputs = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}
+    began, failed, inputs = time.perf_counter(), 0, {"weights": str(out / "weights"), "data": data}
     for number, name in enumerate(PAPER_STUDIES, start=1):
         print(f"coopoc: stage {number} of {len(PAPER_STUDIES) + 1}: {name}", file=sys.stderr)
-        study = find("coopoc.studies", name)
-        results[name] = run_study(study, out=out, jobs=jobs, settings=inputs, retry_failed=True)
+        failed += run_study(name, out=out, jobs=jobs, settings=inputs, retry_failed=True).failed
     print(f"coopoc: stage {len(PAPER_STUDIES) + 1} of {len(PAPER_STUDIES) + 1}: report", file=sys.stderr)
-    texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER_STUDIES.items()}
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
     chosen = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
     page = report(
         [out / name for name in PAPER_STUDIES],
         out / "report.html",
         title="Should vehicles collaborate while they train, or while they decide?",
-        lead=[reported("neighbours", results["neighbours"], ["answer"]), LEAD.format(where=chosen)],
-        answers={question: answer for question, answer in texts.items() if answer},
-        first="neighbours",
+        lead=[LEAD.format(where=chosen)],
         cards={name: in_words(card(name)) for name in bundled},
     )
-    failed, took = sum(each.failed for each in results.values()), (time.perf_counter() - began) / 60
+    took = (time.perf_counter() - began) / 60
     print(f"coopoc: done in {took:.1f} min, {failed} failed cells. The report is {page}", file=sys.stderr)
     return int(failed > 0)
-
-
-def reported(name: str, results: "Results", keys: Sequence[str]) -> str:
-    """The findings of a study under these keys, one after the other."""
-    texts = find("coopoc.studies", name).answers(results)
-    return " ".join(texts[key][:1].upper() + texts[key][1:] for key in keys if key in texts)

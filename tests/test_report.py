@@ -1,6 +1,7 @@
 """The report: one file, nothing outside it, everything that must be said."""
 
 import re
+import shutil
 from html.parser import HTMLParser
 
 import pytest
@@ -95,6 +96,15 @@ def test_the_same_folders_give_the_same_page(made, tmp_path):
     folder = path.parents[1] / "small"
     first, second = (report([folder], tmp_path / name) for name in ("a.html", "b.html"))
     assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_page_on_several_studies_opens_with_what_each_found(made, tmp_path):
+    folder = made[0].parents[1] / "small"
+    manifest = shutil.copytree(folder, tmp_path / "other") / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"study": "small"', '"study": "other"'))
+    opening = report([manifest.parent, folder], tmp_path / "r.html").read_text().partition("<nav")[0]
+    order = ("What is a neighbour worth", "KF: ", '<figure class="first">', '<a href="#other">Details')
+    assert sorted(order, key=opening.index) == [*order]
 
 
 def test_folders_that_cannot_be_shown_are_named(made, tmp_path):

@@ -28,20 +28,18 @@ def report(
     out: str | Path,
     title: str = "",
     lead: Sequence[str] = (),
-    answers: Mapping[str, str] | None = None,
     cards: Mapping[str, Mapping[str, Any]] | None = None,
-    first: str = "",
 ) -> Path:
     """Write one page that shows several studies, and return its path.
+
+    That of several opens with the first finding of each, and the first figure.
 
     Args:
         folders: of finished studies, in the order of the page.
         out: the file.
         title: of the page.
         lead: sentences under the title, before the first study.
-        answers: question -> answer, after the lead; default those of several studies, each with its first finding.
         cards: name of a data set -> field -> value.
-        first: study whose first figure opens the page; default the first that has one.
 
     Raises:
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
@@ -57,11 +55,10 @@ def report(
         )
     several = sections if len(sections) > 1 else []
     opening = [{**s["figures"][0], "section": s["name"]} for s in several if s["figures"]]
-    opening.sort(key=lambda figure: figure["section"] != first)
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
-        answers=answers or {s["question"]: next(iter(s["findings"].values())) for s in several if s["findings"]},
+        answers={s["question"]: next(iter(s["findings"].values())) for s in several if s["findings"]},
         first=opening[0] if opening else None,
         sections=sections,
         cards=cards or {},
