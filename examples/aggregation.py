@@ -326,9 +326,7 @@ STUDY = Study(
     figures={
         "multiples": _multiples,
     },
-    findings=lambda results: {
-        f"scenario {s}, {c}": _finding(results, {"scenario": s, "condition": c}) for s in (1, 2) for c in CONDITIONS
-    },
+    findings=lambda results: [_finding(results, {"scenario": s, "condition": c}) for s in (1, 2) for c in CONDITIONS],
     limitations=(
         "The selected round depends on the reports of all participating clients, the poisoned one included.",
         "Rules have their default parameters, of which some were chosen under iid on town10-validation; krum and "

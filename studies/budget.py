@@ -94,15 +94,15 @@ def choices(results: Results) -> "pd.DataFrame":
     return ideal.groupby(names, sort=False, dropna=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
 
 
-def _findings(results: Results) -> dict[str, str]:
-    texts, each = {}, choices(results)
+def _findings(results: Results) -> list[str]:
+    texts, each = list[str](), choices(results)
     for limit in BYTE_LIMITS if len(each) else ():
         if len(within := each[each[PAYLOAD] <= limit]):
             best = within.sort_values("rt_le_m", kind="stable").iloc[0]
             at = f", K = {best['max_neighbours']}, {best['schedule']}, {best[PAYLOAD]:.0f} B/s" if best[PAYLOAD] else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
             name = f"{look(best['method']).label} ({best['noise_model']})"
-            texts[f"{limit:g} B/s"] = f"{words}: best is {name}{at}, {best['rt_le_m']:.3f} m."
+            texts.append(f"{words}: best is {name}{at}, {best['rt_le_m']:.3f} m.")
     return texts
 
 

@@ -48,12 +48,12 @@ def study(
     """
     methods, rows = labelled(*pairs), [((title,), case) for title, case in cases.items()]
 
-    def findings(results: Results) -> dict[str, str]:
-        texts = {}
+    def findings(results: Results) -> list[str]:
+        texts = []
         for title in named:
             each = ran({label: number(results, {**cases[title], **line}) for label, line in methods.items()})
             if each:
-                texts[title] = f"{title}: {listed(dict(sorted(each.items(), key=itemgetter(1))))}."
+                texts.append(f"{title}: {listed(dict(sorted(each.items(), key=itemgetter(1))))}.")
         return texts
 
     text = f"RT-LE [m]{', rms over runs' * (number is rms)}."

@@ -108,19 +108,16 @@ def _clients(results: Results) -> "Plot":
     return Plot(figure, f"Paths of the clients of {truth.name} from the dot on, steps of {truth.dt:g} s; their speeds.")
 
 
-def _findings(results: Results) -> dict[str, str]:
+def _findings(results: Results) -> list[str]:
     fed, centralised = _curve(results, FEDERATED), _curve(results, CENTRALISED)
-    texts = {}
-    if fed and centralised:
-        end = centralised[-1]
-        reached = settled([value / end for value in fed])
-        within = f"within {100 * REACHED_SHARE:g} % of it"
-        when = f"not {within}" if reached is None else f"{within} from round {reached} on"
-        texts["centralised"] = (
-            f"After {len(fed) - 1} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
-            f"({100 * (fed[-1] / end - 1):+.1f} %); federated is {when}."
-        )
-    return texts
+    if not (fed and centralised):
+        return []
+    end = centralised[-1]
+    reached = settled([value / end for value in fed])
+    within = f"within {100 * REACHED_SHARE:g} % of it"
+    when = f"not {within}" if reached is None else f"{within} from round {reached} on"
+    text = f"After {len(fed) - 1} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
+    return [f"{text}({100 * (fed[-1] / end - 1):+.1f} %); federated is {when}."]
 
 
 def settled(ratios: Sequence[float]) -> int | None:

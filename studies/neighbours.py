@@ -62,13 +62,13 @@ def _interval(results: Results, where: Where) -> Any:
     return (mean if where["method"] == "bound" else interval)(results, where)
 
 
-def findings(results: Results) -> dict[str, str]:
+def findings(results: Results) -> list[str]:
     """Which of training and cooperation is better, and the errors under known covariances beside the bound."""
     k = _most(results, "nominal")
     pairs = {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND}
     each = listed({name: rms(results, of(*pair, max_neighbours=k)) for name, pair in pairs.items()} if k else {})
     text = f"Known covariances, K = {k}, rms over runs: {each}."
-    return {"answer": _answer(results), "nominal": text if each else ""}
+    return [_answer(results), text if each else ""]
 
 
 def _answer(results: Results) -> str:

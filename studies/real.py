@@ -274,30 +274,28 @@ def _trade(results: Results) -> "Plot | None":
     return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 
-def _findings(results: Results) -> dict[str, str]:
-    """Key and sentence of what the cells show; a finding whose cells are missing is left out."""
+def _findings(results: Results) -> list[str]:
+    """What the cells show; a finding whose cells are missing is left out."""
 
     def of(k: int, n: int, value: str = "rt_le_m") -> float | None:
         return mean(results, {**BASE, "max_neighbours": k, "landmarks": n}, value)
 
     ks, marks = _run(results, "max_neighbours"), _run(results, "landmarks")
     if not ks:
-        return {}
-    texts = {}
+        return []
+    texts = []
     alone = ran({n: of(0, n) for n in marks})
     for k in dict.fromkeys((*ks[1:2], ks[-1])):
         together = of(k, 0)
         if not k or together is None or 0 not in alone:
             continue
         each = ", ".join(f"with {_landmarks(n)} {value:.3g} m" for n, value in alone.items())
-        texts[f"worth, K = {k}"] = f"K = {k} without a landmark: {together:.3g} m; alone {each}."
+        texts.append(f"K = {k} without a landmark: {together:.3g} m; alone {each}.")
     nees = list(ran({(k, n): of(k, n, "nees") for k in ks for n in marks}).values())
     if nees:
         text = f"Mean NEES of a pose (3 is consistent): {np.mean(nees):.1f} over {len(nees)} cells"
-        texts["nees"] = f"{text}, {max(nees):.1f} at most."
-        if min(nees) > UNFIT:
-            doubt = "Units, axes or stated noise do not fit the drive"
-            texts["nees"] += f" {doubt}: coopoc data check shows the residuals of each kind."
+        doubt = " Units, axes or stated noise do not fit the drive: coopoc data check shows the residuals of each kind."
+        texts.append(f"{text}, {max(nees):.1f} at most.{doubt * (min(nees) > UNFIT)}")
     return texts
 
 

@@ -69,10 +69,10 @@ def _figure(results: Results) -> "Plot | None":
     return figures.sweep(results, x="max_neighbours", log=True, caption=caption)
 
 
-def _findings(results: Results) -> dict[str, str]:
+def _findings(results: Results) -> list[str]:
     """The best filter at each K, the largest first, and those alike; smoothers know later measurements and are no
     filters."""
-    texts, rows = {}, results.frame
+    texts, rows = list[str](), results.frame
     for k in sorted(rows["max_neighbours"].unique(), reverse=True) if len(rows) else ():
         pairs = rows[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
         each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})
@@ -87,7 +87,7 @@ def _findings(results: Results) -> dict[str, str]:
             near = f" Noise may explain the difference from {', '.join(dict.fromkeys(same))}." * bool(same)
             gap = f", {value / bound:.2f} times the bound" if bound else ""
             named = f" ({model})" if len({model for _, model in each} - {"bound"}) > 1 else ""
-            texts[f"K = {k}"] = f"K = {k}: {look(method).label}{named} has the lowest rms, {value:.3g} m{gap}.{near}"
+            texts.append(f"K = {k}: {look(method).label}{named} has the lowest rms, {value:.3g} m{gap}.{near}")
     return texts
 
 

@@ -44,7 +44,7 @@ STUDY = Study(
     cell=cell,
     grid={"x": (1, 2), "method": ("kalman", SCRIPT)},
     tables={"rt_le": table},
-    findings=lambda results: {"script": f"Finding {SCRIPT}"},
+    findings=lambda results: [f"Finding {SCRIPT}"],
     limitations=(SCRIPT,),
 )
 

@@ -23,7 +23,7 @@ TWO = {"egos": "2", "runs": 2}
 def test_side_by_side_takes_any_methods_and_conditions(tmp_path, short_town):
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
     results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,kalman,bound"})
-    assert "Noise may explain the difference from" in published(tmp_path / "side_by_side")["findings"]["K = 0"]
+    assert "Noise may explain the difference from" in published(tmp_path / "side_by_side")["findings"][-1]
     caption = (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
     assert "With latency_s 0.2, common_share 0.5." in caption
     mild = run_study(
@@ -116,7 +116,7 @@ def test_the_study_runs_and_says_what_it_found(tmp_path):
     shown = published(tmp_path / "aggregation")
     assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]
     assert "equal sensors, equal amounts of data" in shown["tables"][0]["caption"]
-    assert shown["findings"]["scenario 2, poisoned update"].startswith("Scenario 2, poisoned update: mean")
+    assert any(text.startswith("Scenario 2, poisoned update: mean") for text in shown["findings"])
 
 
 @pytest.mark.parametrize(
@@ -136,6 +136,6 @@ def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps, words):
     rows += [{**row, "method": "median", "rt_le_m": row["rt_le_m"] + gaps[row["train_seed"]]} for row in rows]
     axes, settings = ("condition", "method", "scenario"), dict(aggregation.STUDY.settings)
     results = Results("aggregation", "", axes, settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
-    found = aggregation.STUDY.answers(results)
-    assert list(found) == ["scenario 1, iid"]
-    assert words in found["scenario 1, iid"]
+    (text,) = aggregation.STUDY.answers(results)
+    assert text.startswith("Scenario 1, iid: ")
+    assert words in text

@@ -117,9 +117,8 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path,
     own, common = value["own"], value["common"]
     assert own[1] < 0.5 * own[0]
     assert common[1] > 0.8 * common[0]
-    found = study.CORRELATED_GNSS.answers(results)
-    assert list(found) == [f"{name}, K = 10" for name in ("white", "own", "common")]
-    assert all(text.startswith(f"{name}: ") for name, text in found.items())
+    names = [text.partition(":")[0] for text in study.CORRELATED_GNSS.answers(results)]
+    assert names == [f"{name}, K = 10" for name in ("white", "own", "common")]
     folder = tmp_path / "correlated_gnss"
     assert "Cramér-Rao bound, star" in (folder / "tables" / "rt_le.md").read_text()
     assert (folder / "figures" / "rms.pdf").stat().st_size > 5_000

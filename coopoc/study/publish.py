@@ -18,7 +18,7 @@ VIEWS = "views.json"
 _FIELDS = {
     "tables": list,
     "figures": list,
-    "findings": dict,
+    "findings": list,
     "recipe": dict,
     "missing": dict,
     "idle": list,
@@ -68,7 +68,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
                     path.unlink()
     stored = {
         **shown,
-        "findings": dict(made("findings", study.answers) or {}),
+        "findings": made("findings", study.answers) or [],
         "recipe": dict(made("recipe", study.recipe) or {}),
         "missing": missing,
         "idle": sorted(made("idle", study.idle) or ()),
@@ -80,7 +80,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
 
 
 def views(folder: str | Path) -> Mapping[str, Any]:
-    """Read the views of a study: tables and figures by name, findings by key, recipe, missing views, limitations.
+    """Read the views of a study: tables and figures by name, findings, recipe, missing views, limitations.
 
     Raises:
         InputError: the study was not run to its end, the file is damaged, or a view's name is no file name.

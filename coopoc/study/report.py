@@ -58,7 +58,7 @@ def report(
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
-        answers={s["question"]: next(iter(s["findings"].values())) for s in several if s["findings"]},
+        answers={s["question"]: s["findings"][0] for s in several if s["findings"]},
         first=opening[0] if opening else None,
         sections=sections,
         cards=cards or {},

@@ -52,8 +52,7 @@ class Study:
             each other in one worker, so that functools.lru_cache finds the recording.
         tables: name -> function of Results; None where the results lack what the table shows.
         figures: name -> function of Results, likewise.
-        findings: Results -> key -> sentence for the top of the report, empty where the results lack its numbers. The
-            key stays the same when the sentence changes: other code finds it by that.
+        findings: Results -> sentences for the top of the report, empty where the results lack the numbers of one.
         recipe: Results -> field -> value of the training, for the report.
         idle: Results -> names of settings that do nothing in them, which the report leaves out.
         limitations: sentences.
@@ -80,7 +79,7 @@ class Study:
     shares: tuple[str, ...] = ()
     tables: "Mapping[str, Callable[[Results], Table | None]]" = field(default_factory=dict)
     figures: "Mapping[str, Callable[[Results], Plot | None]]" = field(default_factory=dict)
-    findings: "Callable[[Results], Mapping[str, str]]" = lambda results: {}
+    findings: "Callable[[Results], Sequence[str]]" = lambda results: ()
     recipe: "Callable[[Results], Params]" = lambda results: {}
     idle: "Callable[[Results], Collection[str]]" = lambda results: ()
     limitations: tuple[str, ...] = ()
@@ -129,13 +128,13 @@ class Study:
             raise InputError("tracks", self.name, "has cells without estimates of vehicles", "Take side_by_side.")
         return self.tracks
 
-    def answers(self, results: "Results") -> dict[str, str]:
-        """Findings by key: those whose numbers were run.
+    def answers(self, results: "Results") -> list[str]:
+        """Findings whose numbers were run.
 
-        >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).answers(None)
-        {'a': 'It does.'}
+        >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: ["It does.", ""]).answers(None)
+        ['It does.']
         """
-        return {key: text for key, text in self.findings(results).items() if text}
+        return [text for text in listed("findings", self.findings(results), "Give a list of sentences.") if text]
 
     def override(self, changes: Params) -> "Study":
         """The same study with other settings, or other values on an axis (a list, or words split at commas).

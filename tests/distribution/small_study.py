@@ -94,7 +94,7 @@ STUDY = Study(
     shares=("max_neighbours",),
     tables={"rt_le": table},
     figures={"rt_le": figure},
-    findings=lambda r: {"kalman": f"KF: {r.interval('rt_le_m', method='kalman', max_neighbours=0)} m."},
+    findings=lambda r: [f"KF: {r.interval('rt_le_m', method='kalman', max_neighbours=0)} m."],
     recipe=lambda r: {"training": "none: nothing here learns"},
     limitations=("No vehicle drives in circles.",),
 )

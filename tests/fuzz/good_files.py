@@ -111,7 +111,7 @@ VIEWS = json.dumps(
             }
         ],
         "figures": [],
-        "findings": {"gain": "It falls."},
+        "findings": ["It falls."],
         "recipe": {},
         "missing": {},
         "limitations": ["One town."],
