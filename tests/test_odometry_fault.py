@@ -82,7 +82,8 @@ def test_a_neighbour_whose_wheels_spin_costs_the_joint_filter_little():
 def test_odometry_that_errs_a_little(fault, every, beside):
     """The second half of half an hour. Ships in a current of a ninth of their speed: Kalman and joint filter were 46,
     97 and 205 m off, the cooperative 19, 39 and 147, with fixes of 30 m 470, as receivers might wander by 900; if their
-    odometry then stands still, it is 143 where the slow pace is preferred. Mowers that slip for 10 s a minute: it was 30 m off."""
+    odometry then stands still, it is 143 where the slow pace is preferred. Mowers that slip for 10 s a minute: it
+    was 30 m off."""
     t, ships = np.arange(1800.0), fault != "slips"
     course = 0.9 * np.sin(0.008 * t) if ships else np.pi * np.cumsum((t % 29 > 25) / 3.0)
     u = np.where(ships, 7.0, 0.8) * np.stack([np.cos(course), np.sin(course), 0.0 * t], axis=-1)[:, None]
