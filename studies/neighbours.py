@@ -82,8 +82,8 @@ def _answer(results: Results) -> str:
         return ""
     better = "decide, where messages arrive" if joint < fed else "train"
     return (
-        f"While they {better}: with fitted covariances {k} neighbours give {joint:.2f} m, federated training alone "
-        f"{fed:.2f} m; with the paper's identity covariances cooperation gives {paper:.2f} m."
+        f"Vehicles should collaborate while they {better}: with fitted covariances {k} neighbours give {joint:.2f} m, "
+        f"federated training alone {fed:.2f} m; with the paper's identity covariances cooperation gives {paper:.2f} m."
     )
 
 
