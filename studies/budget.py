@@ -145,7 +145,6 @@ STUDY = lineup.study(
             "RT-LE [m] when an ego receives no more than the cap, by schedule; differences are paired, with 95 % "
             f"intervals. K = {MOST_NEIGHBOURS} at 10 Hz.",
             best="min",
-            unranked=("Difference",),
             decimals=3,
         ),
     },

@@ -21,7 +21,8 @@ from .style import METHODS, NOT_CAUSAL_SUFFIX, label, title, words
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
-REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
+UNRANKED = {METHODS["bound"].label, METHODS["oracle"].label, "oracle", "Difference"}
+"""Row labels and titles (or parts of a title between commas) that are never the best."""
 _SMOOTHERS = METHODS["batch-smoother"].label, NOT_CAUSAL_SUFFIX
 """Label of the method that uses later measurements, too: it is not compared with the others."""
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
@@ -37,7 +38,6 @@ class Table:
         caption: with the noise settings; it goes above the table in every format.
         best: "min" or "max": the number in bold, and those alike; nothing where all are.
         along: "row" or "column": where the best number is sought.
-        unranked: row labels and titles (or parts of a title between commas) that are never the best: bounds, oracles.
         decimals: of numbers.
         intervals: show the ends.
         notes: sentences under the table.
@@ -59,7 +59,6 @@ class Table:
     caption: str
     best: Best = None
     along: Literal["row", "column"] = "row"
-    unranked: tuple[str, ...] = REFERENCES
     decimals: int = 2
     intervals: bool = True
     notes: tuple[str, ...] = ()
@@ -75,7 +74,7 @@ class Table:
         """The table whose `vars` were stored as JSON; InputError if it is none."""
         try:
             rows = tuple(tuple(map(_entry, row)) for row in data["rows"])
-            texts: dict[str, Any] = {name: tuple(map(str, data[name])) for name in ("header", "unranked", "notes")}
+            texts: dict[str, Any] = {name: tuple(map(str, data[name])) for name in ("header", "notes")}
             allowed = {"best": ("min", "max", None), "along": ("row", "column"), "decimals": range(20)}
             if wrong := next((name for name, values in allowed.items() if data[name] not in values), ""):
                 raise ValueError(wrong)
@@ -194,7 +193,7 @@ class Table:
             for j, entry in enumerate(row):
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                if isinstance(mean, float) and math.isfinite(mean) and not (names & {*self.unranked} or smooths(names)):
+                if isinstance(mean, float) and math.isfinite(mean) and not (names & UNRANKED or smooths(names)):
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         return [sorted(group, reverse=self.best == "max") for group in places.values()]
 

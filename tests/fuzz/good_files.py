@@ -103,7 +103,6 @@ VIEWS = json.dumps(
                     "caption": "Errors in m",
                     "best": "min",
                     "along": "row",
-                    "unranked": ["oracle"],
                     "decimals": 2,
                     "intervals": True,
                     "notes": ["Four runs."],
