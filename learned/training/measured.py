@@ -48,6 +48,8 @@ def measured_clients(
     >>> line = Fleet(("a",), t, np.zeros((303, 1, 3)), np.ones((303, 1, 3)))
     >>> [(len(c.training), len(c.validation)) for c in measured_clients(MeasuredDrives(observe(line, Sensors()), line))]
     [(2, 1)]
+    >>> [len(c.training) for c in measured_clients(MeasuredDrives(observe(line, Sensors()), line), split=0.1)]
+    [1]
     """
     one_of("start", start, Start)
     instance("drives", drives, MeasuredDrives)

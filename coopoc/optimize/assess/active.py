@@ -133,7 +133,11 @@ def _multipliers(unit: Floats, gradient: Floats, low: Bools, high: Bools) -> Flo
 
 
 def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:
-    """The least step that undoes the gaps of the rows, and orthonormal directions (columns) that no row sees."""
+    """The least step that undoes the gaps of the rows, and orthonormal directions (columns) that no row sees.
+
+    >>> _split(np.array([[2.0, 0.0]]), np.array([4.0]))[0].round()
+    array([-2.,  0.])
+    """
     if not len(unit):
         return np.zeros(unit.shape[1]), np.eye(unit.shape[1])
     left, values, right = np.linalg.svd(unit)
