@@ -73,7 +73,7 @@ def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders):
     assert found["sent_bytes_per_second"].item() == pytest.approx(sent / (len(every) * log.recording.dt))
     gnss = log.recording.gnss.copy()
     gnss[:, :, 2] = gnss[:, 0, 1] = np.nan
-    with refused("car2.*is never there at two steps in a row"):
+    with refused("car2.*is never present at two successive steps"):
         method(replace(log.recording, gnss=gnss), ["car1", "car2"])
 
 
