@@ -124,8 +124,10 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path):
     assert np.nanmean(co.pose_nees(track, log.truth)[:, 100:]) < 6
     kept &= ~frame["kind"].isin(["bearing", "range"]) | (frame["partner"] != "red")
     frame[kept].to_csv(folder / "log.csv", index=False)
+    lost = co.read_log(folder, frame="body")
     with refused("has no fix and sees too little"):
-        co.pose_start(co.read_log(folder, frame="body").recording)
+        co.pose_start(lost.recording)
+    assert "truth's first poses" in check_poses(lost).span
 
 
 def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counted(tmp_path):
