@@ -76,11 +76,11 @@ def arrive(
 
     H = J^T J, until two gain ratios were off by more than a fifth, or the end is near, by HESSIAN_SHARE; then the exact
     Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
-    positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
-    the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps are `bounded`, the last one is below
-    the tolerance. A `smooth` descent ends with the first step whose gain ratio is not within 1/2 .. 3/2. An undamped
-    step that raises the cost is taken with the next one where both lower it by what the first promised: far ends of a
-    long drive turn too far to be moved by straight lines.
+    positive definite J^T J takes over for some steps, or, where these promise next to nothing, it is damped. mu is the
+    multiplier of a trust region |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4.
+    Where the steps are `bounded`, the last one is below the tolerance. A `smooth` descent ends with the first step
+    whose gain ratio is not within 1/2 .. 3/2. An undamped step that raises the cost is taken with the next one where
+    both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3;
@@ -107,7 +107,7 @@ def arrive(
             taken = step(x, whole, gradient)
             if taken is None:
                 record.append((cost, mu, np.nan))
-                if model == "newton":
+                if model == "newton" and not still:
                     against, model = -HESSIAN_AFTER_STEPS, "gauss-newton"
                     cost, gradient, values = undamped = system.quadratic(x, model)
                 else:
