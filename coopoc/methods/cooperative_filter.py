@@ -298,7 +298,14 @@ def rejected(what: str, count: int, measured: int, share: float = 0.05) -> list[
 
 
 def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
-    """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: then their errors last."""
+    """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: then their errors last.
+
+    >>> white = np.random.default_rng(0).normal(size=(1, 400, 3))
+    >>> lasting("a", white.repeat(2, axis=1), dt=0.1)  # errors of 0.2 s
+    []
+    >>> len(lasting("a", white.repeat(20, axis=1), dt=0.1))
+    1
+    """
     lag = max(round(1.0 / dt), 1)
     product, square = residual[:, lag:] * residual[:, :-lag], np.nansum(residual**2)
     correlation = (
