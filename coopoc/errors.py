@@ -29,8 +29,8 @@ class InputError(ValueError):
 def shown(value: object, longest: int = 60) -> str:
     """The repr of any value, cut; of an object whose own repr fails, its class.
 
-    >>> shown("a" * 100, 3), shown([1])
-    ("'aa", '[1]')
+    >>> shown("a" * 100, 3), shown([1]), len(shown("a" * 100))
+    ("'aa", '[1]', 60)
     """
     try:
         return repr(value)[:longest]

@@ -193,7 +193,9 @@ def test_axes_that_are_turned_or_flipped_are_named(tmp_path, kind, change, said)
     own = log["kind"] == kind
     log.loc[own, "value"] = wrapped(change[0] * log["value"][own] + change[1])
     log.to_csv(tmp_path / "log.csv", index=False)
-    assert re.search(said, "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame="body")).warnings))
+    words = "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame="body")).warnings)
+    assert re.search(said, words)
+    assert "too fast" not in words
 
 
 def test_the_check_scores_those_whose_truth_is_known(tmp_path):
