@@ -8,9 +8,9 @@ from oracles.pace import after
 FLAT, UNKNOWN = 1e6, np.pi**2 / 3
 
 
-def jacobian(f, x):  # type: ignore[no-untyped-def]
+def jacobian(f, x, size=1e-6):  # type: ignore[no-untyped-def]
     """Derivatives (M, n) of f at x (n,) by central differences."""
-    steps = 1e-6 * np.diag(1 + np.abs(x))
+    steps = size * np.diag(1 + np.abs(x))
     return np.stack([(f(x + h) - f(x - h)) / (2 * h.sum()) for h in steps], axis=1)
 
 
@@ -33,12 +33,19 @@ def wrapped(residual, angle):  # type: ignore[no-untyped-def]
     return np.where(angle, np.angle(np.exp(1j * residual)), residual)
 
 
+def curvature(gap, P):  # type: ignore[no-untyped-def]
+    """Variances tr(H P H P) / 2 of range, bearing and inclination of a vector that errs by P."""
+    slopes = jacobian(lambda v: jacobian(lambda end: spherical(np.zeros(4), end), v).ravel(), gap, 1e-3)
+    both = slopes.reshape(3, 3, 3) @ P
+    return np.einsum("cij,cji->c", both, both) / 2
+
+
 def update(x, P, h, z, variance, angle, passes=1):  # type: ignore[no-untyped-def]
     """Gauss-Newton steps from one prior (x, P); the first is the extended Kalman filter's."""
     at = x
     for _ in range(passes):
         H = jacobian(h, at)
-        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(variance))
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(variance(at)))
         at = x + K @ (wrapped(z - h(at), angle) - H @ (x - at))
     return at, (np.eye(len(x)) - K @ H) @ P
 
@@ -79,9 +86,9 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
         for n in np.flatnonzero(drive.active[t]):
             own, b = drive.own[run, t, n], d * n
             if np.isfinite(own[3]):
-                flat, P = update(flat, P, lambda s, b=b: s[b + 3 : b + 4], own[3:4], [noise.heading], [True])
+                flat, P = update(flat, P, lambda s, b=b: s[b + 3 : b + 4], own[3:4], lambda _: [noise.heading], [True])
             if np.isfinite(own[:3]).all():
-                flat, P = update(flat, P, lambda s, b=b: s[b : b + 3], own[:3], np.array(noise.fix), [False] * 3)
+                flat, P = update(flat, P, lambda s, b=b: s[b : b + 3], own[:3], lambda _: noise.fix, [False] * 3)
         links = range(drive.first[t], drive.first[t + 1])
         located = [P[d * k, d * k] < FLAT / 2 for k in range(members)]
         links = [k for k in links if located[drive.ends[k, 0]] and (drive.ends[k, 1] < 0 or located[drive.ends[k, 1]])]
@@ -96,18 +103,28 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
     """All components that were measured, at once."""
     run, links, d = where
 
+    def ends(s, k):  # type: ignore[no-untyped-def]
+        other = drive.landmark[k] if drive.ends[k, 1] < 0 else s[d * drive.ends[k, 1] :][:3]
+        return s[d * drive.ends[k, 0] :][:d], other
+
     def h(s):  # type: ignore[no-untyped-def]
         predicted = []
         for k in links:
-            mine, other = s[d * drive.ends[k, 0] :][:d], drive.landmark[k]
-            if drive.ends[k, 1] >= 0:
-                other = s[d * drive.ends[k, 1] :][:3]
+            mine, other = ends(s, k)
             longer = np.array([mine[6], 0, 0]) if d > 6 else 0
             predicted.append((spherical(mine, other) + longer)[np.isfinite(drive.relative[run, k])])
         return np.concatenate(predicted)
+
+    def variance(s):  # type: ignore[no-untyped-def]
+        more = [[0.0] * len(kind)]
+        for k in links if passes > 1 else ():
+            gap = lambda s, k=k: ends(s, k)[1] - ends(s, k)[0][:3]  # noqa: E731
+            to = jacobian(gap, s)
+            more.append(curvature(gap(s), to @ P @ to.T)[np.isfinite(drive.relative[run, k])])
+        return np.array(noise.relative)[kind] + np.concatenate(more[passes > 1 :])
 
     z = np.concatenate([drive.relative[run, k][np.isfinite(drive.relative[run, k])] for k in links])
     kind = np.concatenate([np.flatnonzero(np.isfinite(drive.relative[run, k])) for k in links])
     if not len(z):
         return x, P
-    return update(x, P, h, z, np.array(noise.relative)[kind], kind > 0, passes)
+    return update(x, P, h, z, variance, kind > 0, passes)

@@ -43,7 +43,7 @@ class Poses(NamedTuple):
         cov: (size, size), to which pending rows have not been applied.
         linear: (size,) state at which relative measurements are linearised.
         prior_x: (size,) before the relative measurements.
-        prior_cov: (size, size).
+        prior_cov: (size, size), zero where these are linear once.
         columns: (ROWS, size) P h of pending rows.
         gains: (ROWS, size) P h / s of these.
         weights: (ROWS,) 1 / s of these.
@@ -109,11 +109,11 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
             total = plus(total, e, entries(cov, k + OFFSET, tile, tiles))
         put(columns, uint64(pending * tiles + tile), total)
     for q in range(pending):
-        share = along(columns, q, ends, row) * poses.weights[q]
+        share = along(columns[q], ends, row) * poses.weights[q]
         for tile in range(tiles):
             left = less(entries(columns, pending, tile, tiles), share, entries(columns, q, tile, tiles))
             put(columns, uint64(pending * tiles + tile), left)
-    s = variance + along(columns, pending, ends, row)
+    s = variance + along(columns[pending], ends, row)
     square, hits = residual * residual / s, poses.hits[k + 1]
     share = inflation(square, gate, hits)
     if math.isfinite(gate):
@@ -139,14 +139,14 @@ def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
 
 
 @part
-def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
+def along(column: Floats, ends: Ends, row: Row) -> float:
     """h^T v of a row and a column."""
     (k, o), (a, b, c, h, e) = ends, row
-    total = a * columns[q, k] + b * columns[q, k + 1] + c * columns[q, k + 2] + h * columns[q, k + HEADING]
+    total = a * column[k] + b * column[k + 1] + c * column[k + 2] + h * column[k + HEADING]
     if e != 0.0:
-        total += e * columns[q, k + OFFSET]
+        total += e * column[k + OFFSET]
     if o >= 0:
-        total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
+        total -= a * column[o] + b * column[o + 1] + c * column[o + 2]
     return float(total)
 
 
@@ -247,20 +247,44 @@ def update_relative(
     Returns:
         The bits, and those of the components that are rejected.
     """
-    (k, o), x, linear = ends, poses.x, poses.linear
+    (k, o), linear = ends, poses.linear
     position = landmark if o < 0 else linear[o : o + 3]
     polar = direction(position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2])
+    curved = curvature(poses.prior_cov, ends, polar)
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):
             continue
         residual, row = relative_row(polar, linear[k + HEADING], component, measured[component], longer)
-        residual -= row[HEADING] * (x[k + HEADING] - linear[k + HEADING])
+        residual -= along(poses.x, ends, row) - along(linear, ends, row)
         if row[HEADING + 1] != 0.0:
-            residual -= x[k + OFFSET]
-        for axis in range(3):
-            residual -= row[axis] * (x[k + axis] - linear[k + axis])
-            if o >= 0:
-                residual += row[axis] * (x[o + axis] - linear[o + axis])
-        if not update_row(poses, ends, row, residual, variances[component], gate):
+            residual -= linear[k + OFFSET]
+        if not update_row(poses, ends, row, residual, variances[component] + curved[component], gate):
             left_out |= 1 << component
     return left_out
+
+
+@part
+def curvature(cov: Floats, ends: Ends, polar: Numbers) -> Three:
+    """Variances tr(H P H P) / 2 of what is not linear in a range, a bearing and an inclination, of second derivatives
+    H, where the vector between both ends errs by P (the second-order filter)."""
+    (ray, side, up), d = axes(polar), max(polar[0], MIN_ANGLE_DISTANCE)
+    flat, out = max(d * polar[3], MIN_ANGLE_DISTANCE), (polar[2], polar[1], 0.0)
+    ss, su, uu = gap_cov(cov, ends, side, side), gap_cov(cov, ends, side, up), gap_cov(cov, ends, up, up)
+    rs, ru, rr = gap_cov(cov, ends, ray, side), gap_cov(cov, ends, ray, up), gap_cov(cov, ends, ray, ray)
+    oo, os, steep = gap_cov(cov, ends, out, out), gap_cov(cov, ends, out, side), d * polar[4] / flat
+    return (
+        (0.5 * (ss * ss + uu * uu) + su * su) / d**2,
+        (oo * ss + os * os) / flat**4,
+        (rr * uu + ru * ru - 2.0 * steep * rs * su + 0.5 * steep**2 * ss * ss) / d**4,
+    )
+
+
+@part
+def gap_cov(cov: Floats, ends: Ends, a: Numbers, b: Numbers) -> float:
+    """Covariance m^2, along two directions, of the vector from a member to another or to a landmark."""
+    (k, o), row, total = ends, (b[0], b[1], b[2], 0.0, 0.0), 0.0
+    for i in range(3):
+        total += a[i] * along(cov[k + i], ends, row)
+        if o >= 0:
+            total -= a[i] * along(cov[o + i], ends, row)
+    return total

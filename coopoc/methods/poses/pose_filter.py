@@ -54,7 +54,8 @@ class PoseFilter:
 
     th' = th + dt w, p' = p + dt R(th + dt w / 2) u; range |p_j - p_i|, bearing atan2(p_j - p_i) - th_i; a component
     that was not measured is no row. A landmark's position is known. With `exact` two more Gauss-Newton steps on the
-    relative measurements follow, from the same prior: the iterated filter.
+    relative measurements follow, from the same prior: the iterated filter. There what is not linear, by second
+    derivatives, counts as noise, so that vague positions do not make exact angles over-confident.
 
     Args:
         unit: "solo", each vehicle with its landmarks; "fleet", all vehicles.
@@ -73,6 +74,8 @@ class PoseFilter:
 
     References:
         Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.4.
+        Bar-Shalom, Li, Kirubarajan, Estimation with applications to tracking and navigation, Wiley 2001, 10.3.2 (the
+        second-order filter).
         Roumeliotis, Bekey, Distributed multirobot localization, IEEE TRA 18(5), 2002 (the fleet's joint state).
         Carrillo-Arce, Nerurkar, Gordillo, Roumeliotis, Decentralized multi-robot cooperative localization using
         covariance intersection, IROS 2013.
