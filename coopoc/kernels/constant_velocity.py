@@ -50,9 +50,9 @@ def constant_velocity(
     count, models = len(t), len(bank)
     velocity, growth, spread, proved = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count)
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
-    p, score = np.zeros((models, 3)), np.zeros((models, 3))
+    p, score, prior = np.zeros((models, 3)), np.zeros((models, 3)), PRIOR_COUNT
     v, best = np.zeros(3), FIRST_FILTER
-    score[:, 0], score[:, 1] = PRIOR_COUNT, PRIOR_COUNT * variance
+    score[:, 0], score[:, 1] = prior, prior * variance
     for j in range(count):
         dt = t[j] - t[j - 1] if j > 0 else math.inf
         if dt > gap:
@@ -79,7 +79,8 @@ def constant_velocity(
                 x[m, c] += clip * a / s * v[c]
                 u[m, c] += clip * b / s * v[c]
             p[m, 0], p[m, 1], p[m, 2] = a / s, b / s, d - b * b / s
-            numbers, squares = keep * numbers + 3.0, keep * squares + min(square, limit) / s
+            numbers = prior + keep * (numbers - prior) + 3.0
+            squares = prior * variance + keep * (squares - prior * variance) + min(square, limit) / s
             logs = keep * logs + 3.0 * math.log(s)
             score[m, 0], score[m, 1], score[m, 2] = numbers, squares, logs
             likely = -0.5 * (numbers * math.log(max(squares / numbers, MIN_VARIANCE)) + logs)
