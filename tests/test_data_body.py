@@ -184,14 +184,16 @@ def test_bearings_that_are_called_azimuths_are_named(tmp_path, frame, hint):
 @pytest.mark.parametrize(
     ("kind", "change", "said"),
     [
-        ("yaw_rate", (-1, 0), "fixes of red, .* turn the other way: scale=yaw_rate:-1"),
+        ("yaw_rate", (-1, 0), "fixes of red, .* turn otherwise: scale=yaw_rate:-1"),
+        ("yaw_rate", (57.3, 0), "fixes of red, .* turn otherwise: scale=yaw_rate:0.0175"),
         ("bearing", (1, 1.5), r"turned by -1\.5\d? rad: add -1\.5"),
     ],
 )
 def test_axes_that_are_turned_or_flipped_are_named(tmp_path, kind, change, said):
     log, _ = table(noise=1.0, compass=False)
     own = log["kind"] == kind
-    log.loc[own, "value"] = wrapped(change[0] * log["value"][own] + change[1])
+    value = change[0] * log["value"][own] + change[1]
+    log.loc[own, "value"] = wrapped(value) if kind == "bearing" else value
     log.to_csv(tmp_path / "log.csv", index=False)
     words = "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame="body")).warnings)
     assert re.search(said, words)

@@ -104,6 +104,9 @@ OF_RANGES: dict[str, Any] = {
     r"drone0 to drone1 by \S+ m, as if to drone2": lambda f: {
         "partner": f["partner"].where(f["vehicle"] != "drone0", f["partner"].replace(OTHER))
     },
+    r"drone1.*(18 s behind the truth|as if its clock was \+1[78]\.)": lambda f: {
+        "t": f["t"] + 18 * (f["vehicle"] == "drone1")
+    },
     r"ranges are 0\.[23]\d+ \+- \S+ s late": lambda f: {"t": f["t"] + 0.3 * f["range"].notna()},
     r"ranges are too long by [45]\.\S+ \+- \S+ %: scale=": lambda f: {"range": 1.05 * f["range"]},
 }

@@ -35,7 +35,7 @@ from .estimates import (
     ratio_of_moves,
     worst,
 )
-from .motion import CLOCKWISE, HOLDS
+from .motion import HOLDS, OTHER_RATES
 from .read import Log
 from .relative import (
     LEAST_OUTLIERS,
@@ -71,11 +71,12 @@ USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of reasons that are no fault of the log."""
-FAULTS = "stamps of", CLOCKWISE.split("{")[0]
+FAULTS = "stamps of", OTHER_RATES.split("{")[0]
 """Beginnings of what is assumed that is a fault."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
-    "repeated rows": "Do stamps lack a fraction, as stamp.sec without nanosec, or in 32 bits? Do two share a name?",
+    "repeated rows": "Do stamps lack a fraction, as stamp.sec without nanosec, or in 32 bits? Do two share a name? "
+    "Nothing is lost where a bus sends each twice.",
     "fixes in gaps of the odometry": "Where a vehicle stands, log a speed of 0; raise max_gap= for longer gaps.",
     "relative measurements of members": PLACED,
     "odometry and headings of vehicles": PLACED,
@@ -263,7 +264,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         )
     axes = _axes(c, column)
     sentences += [f"{name}: {axes}"] * bool(axes)
-    if axes or name in c.log.summary.assumed.get(CLOCKWISE, ()):
+    if axes or any(what.startswith(FAULTS[1]) and name in who for what, who in c.log.summary.assumed.items()):
         return sentences
     if _beyond(row, "fixes_late_s", BEHIND):
         sentences.append(
@@ -341,8 +342,8 @@ def _late(c: Check, row: Mapping[str, Any]) -> bool:
 
 def _drifts(c: Check, row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row errs."""
-    errors = ("speed_excess", LEAST_SCALE), ("turned", LEAST_TURN), ("yaw_rate_bias", LEAST_DRIFT)
-    return row["vehicle"] in c.failing or any(_beyond(row, *one) for one in errors)
+    least = {"speed_excess": LEAST_SCALE, "turned": LEAST_TURN, "yaw_rate_bias": LEAST_DRIFT, "fixes_late_s": BEHIND}
+    return row["vehicle"] in c.failing or any(_beyond(row, *one) for one in least.items())
 
 
 def _of_clocks(c: Check) -> list[str]:

@@ -11,7 +11,7 @@ from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
 
-from .motion import COURSE, MOVING
+from .motion import COURSE, MOVING, OF_FASTEST
 from .residuals import Check, distances, filtered, plane, residual_of
 
 SURE_ERRORS, SURE_CLOCK_ERRORS = 4.0, 5.0
@@ -227,9 +227,10 @@ def odometry(c: Check, column: int) -> Estimate:
         value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
         attenuation = (np.linalg.norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
         turned = (1 + complex(*value[:2])) * (1 + attenuation)
-        if not turned:
+        if abs(turned.real) < LEAST_FORWARD:
             return none
-        value[:2], value[2] = _polar(1 / turned), -value[2]
+        value[:2], value[2] = _polar(1 / turned), -value[2] / turned.real
+        error[2] /= abs(turned.real)
         error[:2] = np.hypot(error[:2], attenuation) / abs(turned) ** 2
         if abs(value[2]) > max(5.0 * BEHIND, SURE_ERRORS * error[2]):  # smoothed fixes cut bends: all else seems wrong
             error[[0, 1, 3, 4]] = np.inf
@@ -243,7 +244,8 @@ def odometry(c: Check, column: int) -> Estimate:
         true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)])
     used = np.isfinite(odometer + x.sum(axis=0))
-    used &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
+    pace = np.maximum(np.abs(true), np.abs(odometer))
+    used &= pace > min(MOVING, OF_FASTEST * np.nanmax(pace, initial=0.0))  # standing, nothing errs
     constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), np.linalg.norm(noise) / len(noise) ** 0.5
     value, error = _of_motion((odometer - true)[used], x[:, used], constant, usual)
     forward = 1 + value[0]
@@ -390,7 +392,7 @@ def _beside(off: AnyArray, velocity: AnyArray) -> float:
 
 
 def against_truth(c: Check) -> Check:
-    """The same, with ranges, and in the world directions, against the truth where both ends have one that
+    """The same, with ranges, and directions by headings that are known, against the truth where both ends have one that
     their fixes fit, or one stands as a landmark; without those of vehicles whose fixes do not fit."""
     truth, rec, noise = c.log.truth, c.world, c.world.sensors
     if truth is None:
@@ -399,11 +401,14 @@ def against_truth(c: Check) -> Check:
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
-    residual, stated = (
-        residual_of(rec, x, c.log.summary.reversed_pairs)[1],
-        [noise.range_std, noise.world_azimuth_std, noise.inclination_std],
-    )
-    used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
+    residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
+    if c.log.recording.body is None:
+        stated[1] = noise.world_azimuth_std
+    else:
+        turned = rec.relative[0, :, 1] - c.log.recording.relative[0, :, 1]
+        known = np.full(rec.gnss[0, ..., 0].shape, np.nan) if truth.heading is None else truth.heading
+        residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
+    used = np.isfinite(residual)
     relative = np.where(used, residual, c.relative)
     fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)  # of others nothing is known
     expected = np.where(used, stated, c.expected)

@@ -22,8 +22,9 @@ SURE = 0.15
 """rad, standard deviation of a heading below which it is one."""
 GYRO_BIAS, GYRO_WALK, SCALE = 0.02, 0.01, 0.03
 """rad/s, bias of a yaw rate; rad in a root of a second, by which its integral wanders; share by which a speed errs."""
-MIRRORED = 0.5
-"""Of the squared innovations, that are left where yaw rates count the other way round."""
+OTHERWISE, FITS_BETTER = (1.0, -1.0, np.pi / 180), 0.5
+"""Factors of yaw rates that may have been meant: none, clockwise, degrees; share of the squared innovations of the
+first that another leaves."""
 
 HeadingAt = Callable[[Floats], Floats]
 
@@ -126,9 +127,9 @@ def heading_until(heading: Signal, yaw_rate: Signal | None) -> HeadingAt:
     return lambda at: wrap(held(offset, at)[:, 0] + _angle(yaw_rate, at))
 
 
-def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
+def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
     """Heading of what measures speed and yaw rate alone, by `poses_of`, anew behind each gap of the yaw rate that is
-    longer than `gap` s; None if none is found. And whether yaw rates of the other sign fit fixes better by far.
+    longer than `gap` s; None if none is found. And which factor of yaw rates fits fixes best by far.
 
     A heading that errs by s rad at a speed of v m/s makes the position wander, between fixes of r m that are T s apart,
     by q m^2/s = (2 s^2 v^2)^(2/3) (r^2 T)^(1/3).
@@ -136,18 +137,19 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
     >>> t = np.arange(0, 60, 0.5)
     >>> circle = 2.0 * np.column_stack([np.sin(0.2 * t), -np.cos(0.2 * t)])
     >>> way = Reckoning(Signal(t, circle), Signal(t, np.full((120, 1), 0.4)), Signal(t, np.full((120, 1), 0.2)), 1.0)
-    >>> course, mirrored = heading_of_rates(way, 1.0)
-    >>> course.at(np.array([50.0])).round(1), mirrored  # 10 rad
-    (array([-2.6]), False)
+    >>> course, factor = heading_of_rates(way, 1.0)
+    >>> course.at(np.array([50.0])).round(1), factor  # 10 rad
+    (array([-2.6]), 1.0)
     """
     per_part = [*map(poses_of, way.parts(gap))]
     if not per_part:
-        return None, False
+        return None, 1.0
     t, heading, variance, squares = (np.concatenate(each) for each in zip(*per_part, strict=True))
-    ours, others = squares.reshape(-1, 2).sum(axis=0)
+    squares = squares.reshape(-1, len(OTHERWISE)).sum(axis=0)
+    factor = OTHERWISE[squares.argmin() * int(squares.min() < FITS_BETTER * squares[0])]
     known, rate = np.isfinite(heading), way.yaw_rate
     if not known.any():
-        return None, False
+        return None, factor
     last = heading_until(Signal(t, heading[:, None]), rate)
 
     def at(times: Floats) -> Floats:
@@ -160,13 +162,13 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, bool]:
         return rise
 
     s = float(np.sqrt(np.median(variance[known])))
-    return Course(at, "fixes", of_pace=of_pace, unsure=s), bool(others < MIRRORED * ours)
+    return Course(at, "fixes", of_pace=of_pace, unsure=s), factor
 
 
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     """Times (M,) s and headings (M,) rad, NaN until one is SURE, of the pose filter whose innovations are the least
-    until then, of those that begin in FIRST_DIRECTIONS directions; their variances (M,) rad^2; and the least sums (2,)
-    of squared innovations over their variances, with the yaw rates and with those of the other sign."""
+    until then, of those that begin in FIRST_DIRECTIONS directions; their variances (M,) rad^2; and the least sums of
+    squared innovations over their variances, with the yaw rates by each factor of OTHERWISE."""
     fixes, speed, rate, std, walk = way
     span = max(float(rate.t[-1] - fixes.t[0]), FILTER_STEP)
     dt = max(FILTER_STEP, span / min(PER_SAMPLE * len(rate.t), MOST_STEPS))
@@ -183,12 +185,12 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     step = steps_of(fixes.t - t[0], dt, len(t))
     gnss = np.full_like(rec.gnss, np.nan)
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
-    runs = np.arange(2 * FIRST_DIRECTIONS)
+    runs = np.arange(len(OTHERWISE) * FIRST_DIRECTIONS)
     rec = replace(rec, gnss=gnss).of_runs(0 * runs)
     assert rec.body is not None
-    sign = np.where(runs < FIRST_DIRECTIONS, 1.0, -1.0)[:, None, None]
-    rec = replace(rec, body=replace(rec.body, yaw_rate=sign * rec.body.yaw_rate))
-    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs, [0, 0, 0, 2 * np.pi / FIRST_DIRECTIONS])
+    meant = np.repeat(OTHERWISE, FIRST_DIRECTIONS)[:, None, None]
+    rec = replace(rec, body=replace(rec.body, yaw_rate=meant * rec.body.yaw_rate))
+    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs % FIRST_DIRECTIONS, [0, 0, 0, 2 * np.pi / FIRST_DIRECTIONS])
     spread = std, std, PLANE_STD, np.pi / FIRST_DIRECTIONS
     track = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
     assert track.covariance is not None
@@ -199,7 +201,7 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     best = sums[:FIRST_DIRECTIONS].argmin(axis=0), np.arange(len(t))
     heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
     known = np.maximum.accumulate(variance < SURE**2)
-    return t, np.where(known, heading, np.nan), variance, sums[:, -1].reshape(2, -1).min(axis=1)
+    return t, np.where(known, heading, np.nan), variance, sums[:, -1].reshape(len(OTHERWISE), -1).min(axis=1)
 
 
 def held(signal: Signal, at: Floats) -> Floats:

@@ -43,7 +43,7 @@ CLIMBS = (0.5, 1.0, 2.0, 5.0, 10.0)
 COURSE = "the heading of {} is the course of the {}, carried on by yaw rates if logged: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
 HOLDS = "fixes that stay while the odometry moves on"
-CLOCKWISE = "yaw rates are anticlockwise, but fixes of {} turn the other way: scale=yaw_rate:-1 mends it"
+OTHER_RATES = "yaw rates are rad/s anticlockwise, but fixes of {} turn otherwise: scale=yaw_rate:"
 NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
 
 VELOCITIES = ("vx", "vy", "vz")
@@ -188,7 +188,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     gyro = float(only(rows, "yaw_rate")["std"].median() * np.median(np.diff(turn.t)) ** 0.5) if len(turn.t) > 1 else 0.0
     if gyro > 0.0:
         way = way._replace(walk=gyro)
-    shown, (derived, mirrored) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
+    shown, (derived, factor) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, VELOCITIES[:2], Summary(), 2), steps._replace(max_gap=np.inf)
@@ -206,9 +206,9 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         fixes = Signal(fixes.t, fixes.value - turned(off, angle))
         way = way._replace(fixes=fixes)
         shown = velocity_of_fixes(way, steps)
-        derived, mirrored = heading_of_rates(way, steps.gap(turn.t))
-    if mirrored:
-        summary.assume(CLOCKWISE, name)
+        derived, factor = heading_of_rates(way, steps.gap(turn.t))
+    if factor != 1.0:
+        summary.assume(f"{OTHER_RATES}{factor:.3g} mends it", name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):

@@ -8,7 +8,7 @@ import pandas as pd
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
-from .estimates import LEAST_COUNT, MOVED_STDS, OUTLYING, SURE_ERRORS, offsets, pairs
+from .estimates import LAG_STEP, LEAST_COUNT, LONGEST_LAG, MOVED_STDS, OUTLYING, SURE_ERRORS, offsets, pairs
 from .frames import UNSTATED
 from .motion import MOVING
 from .residuals import Check, plane
@@ -32,9 +32,9 @@ LASTS_STDS = 0.6
 """Standard deviations of two fixes by which receivers may be off for long, over OUTLYING."""
 MEDIAN_WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
-WRONG_SHARE, NAMED_CASES = 0.8, 4
+WRONG_SHARE, NAMED_CASES, MISFITS = 0.8, 4, 500
 """Share of a part of a drive in which something is wrong, and of the drive that such a part may be; cases that a
-sentence names."""
+sentence names; measurements that show what they are of."""
 
 
 def measurements(c: Check) -> list[dict[str, Any]]:
@@ -89,7 +89,7 @@ def of_measurements(c: Check) -> list[str]:
         hint = HINTS[name]
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = max(should**2 - least**2, 0.0) ** 0.5
-        wrong = std > WIDE_RATIO * should or (name == "azimuth" and std > MAX_ANGLE_STD > 3 * position)
+        wrong = std > WIDE_RATIO * max(should, noise) or (name == "azimuth" and std > MAX_ANGLE_STD > 3 * position)
         scaled = False
         if name != "range":
             wrong |= abs(median) > 3 * should
@@ -140,7 +140,7 @@ def of_measurements(c: Check) -> list[str]:
             sentences.append(
                 f"{word}s of {shown} are off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
-                + (f"offset={offsets_text} takes it off." if word == "range" else "offset= takes it off.")
+                + (f"offset={offsets_text} takes it off." if word == "range" else f"offset=NAME.{word}: takes it off.")
             )
         if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):
             size, std_of = ("less", max(noise, MIN_STD_SHARE * least)) if noise < least else ("more", noise)
@@ -169,11 +169,16 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         if len(bad) < LEAST_COUNT:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
-        x = c.x[links.step[rows[bad]]]
-        gaps = np.linalg.norm(x - x[:, [one]], axis=2) - measured[rows[bad], None]
-        for like, gap in zip(ids, gaps.T, strict=True):
-            if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE_RATIO * np.median(expected) < 0.2 * size:
-                text += f", as if to {like}"
+        some = rows[bad[:: len(bad) // MISFITS + 1]]
+        steps, lags = links.step[some][:, None], np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
+        then = (steps - np.round(lags / c.world.dt).astype(int)).clip(0, len(c.x) - 1)
+        places = np.concatenate([c.x[steps[:, 0]], c.x[then, other]], axis=1)  # of all, and of its own before and later
+        far = np.linalg.norm(places - c.x[steps, one], axis=2)
+        miss = pd.DataFrame(np.abs(far - measured[some, None])).median().fillna(np.inf)
+        best = int(miss.argmin())
+        if k == 0 and miss[best] < WIDE_RATIO * np.median(expected) < 0.2 * size:
+            clock = f"its clock was {lags[best - len(ids)]:+.1f} s beside the other's"
+            text += f", as if {f'to {ids[best]}' if best < len(ids) else clock}"
         misfit_of[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
     return misfit_of
 
