@@ -25,7 +25,6 @@ from coopoc.study.reference import Reference
 from coopoc.study.report import report
 from coopoc.world.body_frames import true_heading
 from coopoc.world.sensors import ANGULAR
-from coopoc.world.v2x import NO_MESSAGE
 
 WRONG: tuple[Any, ...] = (
     None,
@@ -83,15 +82,6 @@ HOSTILE: tuple[Any, ...] = (
 )
 """What pandas, masks, paths and libraries from elsewhere bring in."""
 ALL = (*WRONG, *RAGGED, *HOSTILE)
-METHODS: tuple[Any, ...] = (
-    co.GNSS,
-    co.Kalman,
-    co.JointFilter,
-    co.LKFSA,
-    co.MSMV,
-    co.BatchSmoother,
-    co.CovarianceIntersection,
-)
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
 RECORDING = co.observe(FLEET, SENSORS, CHANNEL)
@@ -217,7 +207,16 @@ BOUND: dict[str, Any] = {"fleet": TOWN, "sensors": NOISE, "v2x": CHANNEL}
 PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     **{
         kind.__name__: (partial(follow, kind), {**FOLLOWED, **init(kind())})
-        for kind in (*METHODS, co.CooperativeFilter)
+        for kind in (
+            co.GNSS,
+            co.Kalman,
+            co.JointFilter,
+            co.LKFSA,
+            co.MSMV,
+            co.BatchSmoother,
+            co.CovarianceIntersection,
+            co.CooperativeFilter,
+        )
     },
     **{
         type(noun).__name__: (type(noun), init(noun))
@@ -264,7 +263,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "RelativeMeasurement": (co.RelativeMeasurement, MESSAGE),
     "StarStream": (star, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
     "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "per_neighbour": 0}),
-    "Message.size": (NO_MESSAGE.size, {"overhead": 0, "neighbours": 3}),
+    "Message.size": (co.GNSS().message.size, {"overhead": 0, "neighbours": 3}),
     "Recording.stretches": (SEEN.stretches, {"vehicle": 0, "shortest": 2}),
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (
@@ -398,7 +397,8 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path):
         co.load_fleet,
         co.read_log,
     ):
-        swept(lambda path, read=read: read(path), {"path": "nowhere.pyfg"})
+        for value in ALL:
+            ours(partial(read, value), f"path={shown(value, 40)}")
     for value in (None, 1, [], b"x"):
         with refused("study"):
             co.run_study(value, tmp_path)  # type: ignore[arg-type]

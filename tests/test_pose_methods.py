@@ -65,8 +65,7 @@ def test_joint_is_best_intersection_is_cautious_and_naive_is_not():
     """The optimum has all cross-covariances; without them estimates are used twice (Julier, Uhlmann, ACC 1997)."""
     fleet = convoy()
     seen = observed(fleet, runs=12)
-    kinds = ("joint", "naive", "intersection")
-    tracks = {name: co.PoseFilter("fleet", fusion=name)(seen, range(5)) for name in kinds}
+    tracks = {name: co.PoseFilter("fleet", fusion=name)(seen, range(5)) for name in ("joint", "naive", "intersection")}
     assert (tracks["naive"].sent_bytes == 200 * 64).all()
     tracks["solo"] = co.PoseFilter("solo")(seen, range(5))
     error = {name: float(co.rt_le(track, fleet).mean()) for name, track in tracks.items()}

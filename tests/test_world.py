@@ -92,8 +92,6 @@ def test_float32_is_refused_and_unwrapped_headings_are_not():
     stream = PoseFilter("solo", assumed=S2).start(0.1)
     for heading, fix in zip(t.tolist(), circles[:, 0], strict=True):
         stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, fix, heading))
-    with refused("heading = 90.0: must be within"):
-        stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, heading=90.0))
 
 
 def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
@@ -221,7 +219,7 @@ def test_unknown_and_unrecorded_egos(crossing):
     with refused("egos"):
         recording.columns(["ghost"])
     assert recording.columns(["c2", 1]) == [2, 1]
-    assert np.array_equal(recording.between(0, len(recording.t)).arrival, recording.arrival)
+    assert np.array_equal(recording.between(0, 999).arrival, recording.arrival)
 
 
 @pytest.mark.parametrize(("seed", "run"), [(0, 0), (7, 99), (2**32 - 1, 3), (2**32, 2)])
