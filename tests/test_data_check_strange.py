@@ -56,6 +56,7 @@ def test_millimetres_and_wheels_of_robots_are_named(tmp_path):
     text = said(folder, "frame=body")
     assert "scale=range:0.001 (of mm" in text
     assert re.findall(r"(\w+): its odometry is too fast by 3\.0|2\.9", text)
+    assert "ranges scatter more than stated" in said(folder, "frame=body&scale=range:0.001&std=range:0.01")
     text = said(folder, "frame=body&scale=range:0.001")
     assert set(re.findall(r"(\w+): its odometry is too fast by", text)) == {"robot0", "robot1"}
     assert "ranges" not in text
