@@ -45,8 +45,8 @@ INITIAL_LOCKOUT = 4.8
 """That sum at the start of a pose or of a relative vector: a wrong heading or a wrong first measurement may have placed
 it, so the next ones that contradict it are believed. Of a position it is 0, since fixes err together."""
 SLIP_M2 = 0.25
-"""m^2, variance on each axis that slipping wheels, or a speed that was measured too low, may add to an error: a smaller
-innovation is no sign of a wrong fix, however precise fixes are."""
+"""m^2, the most that slipping wheels, or a speed that was measured too low, add to the variance of an error on each
+axis: a smaller innovation is no sign of a wrong fix, however precise fixes are."""
 AWAY = 0.5
 """Sum of the gains of accepted fixes from which they, and not the remembered position, have placed the filter: that
 position is then forgotten if it is less far away than it is uncertain."""

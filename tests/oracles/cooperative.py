@@ -551,7 +551,7 @@ class Oracle:
         self.state.members.remove(j)
 
     def add_fix(self, t, fix: Floats):
-        s, louder = self.state, exp(self.state.level[3])
+        s, louder, way = self.state, exp(self.state.level[3]), self.state.speed * self.state.unseen
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s.vague:
             self.learn_fix(3, rows)
@@ -564,7 +564,8 @@ class Oracle:
         if self.priors.fix_gate and self.ego not in s.vague:
             self.go_back(t, fix, rows)
             rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
-        s.share = self.use_fix(t, self.ego, rows, True)
+        slip = self.may_slip(self.r[t, self.ego] * self.white, way**2)
+        s.share = self.use_fix(t, self.ego, rows, True, slip)
         self.corrected()
 
     def go_back(self, t, fix: Floats, rows: list[Any]):
@@ -611,13 +612,16 @@ class Oracle:
         cov = h @ b.p @ h.T
         return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
 
-    def use_fix(self, t, j, rows: list[Any], again: bool) -> float:
+    def may_slip(self, fix: Floats, way2: float) -> float:
+        return min(SLIP_M2, max(float(np.mean(fix)), 0.25 * way2))
+
+    def use_fix(self, t, j, rows: list[Any], again: bool, slip: float) -> float:
         """The share of its information that is used."""
-        share, hits = self.share_of(t, j, rows, again), self.state.hits
+        share, hits = self.share_of(t, j, rows, again, slip), self.state.hits
         hits[j] = hits.get(j, 0) + 1 if share < 1 else 0
         return share
 
-    def share_of(self, t, j, rows: list[Any], again: bool) -> float:
+    def share_of(self, t, j, rows: list[Any], again: bool, slip: float) -> float:
         """That share, the less, the more in a row were rejected; trust may be revoked."""
         s, g, b = self.state, self.priors, self.state.belief
         used = [c for c, row in enumerate(rows) if row is not None]
@@ -653,7 +657,7 @@ class Oracle:
         q = square
         if j == self.ego and len(self.fix_terms(j)) == 1:
             q = float((((gap - s.off[used]) ** 2) / (s.cov[used] + r)).sum())
-        q = min(q, float(gap @ gap) / SLIP_M2)
+        q = min(q, float(gap @ gap) / slip)
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
             if q > g.fix_gate and hits < PATIENCE:
@@ -1035,7 +1039,8 @@ class Oracle:
         rows = [self.said(message, last, j, q, moved, steps, follows, c) for c in range(3)]
         if last and j not in s.vague and j in s.trusted and None not in rows:
             self.learn_fix(4, rows)
-        self.use_fix(t, j, rows, last is not None)
+        slip = self.may_slip(self.r[message.step, j], float(np.square(moved).sum()))
+        self.use_fix(t, j, rows, last is not None, slip)
         b.noise(("x", j), (1 - half) * spent)
         s.last[j], s.since[j] = message, message.step
         return message._replace(process=q)

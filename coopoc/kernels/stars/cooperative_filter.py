@@ -15,7 +15,7 @@ from ..compiling.small import apply, inner_product, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
-from .cooperative_messages import doubt_ego, fix_terms, goes_on, receive, trust, use_fix
+from .cooperative_messages import doubt_ego, fix_terms, goes_on, may_slip, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -120,6 +120,7 @@ from .otherwise import (
     PENDING,
     SLIP_DURATION_S,
     SLIPPED,
+    SPEED_OF_LATE,
     SQUARES,
     STAR_MEMORY_S,
     Tries,
@@ -401,6 +402,7 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
     if math.isnan(own[FIX]):
         return
     fix_terms(f, 0)
+    way = f.ego[SPEED_OF_LATE] * f.ego[SINCE_FIX]
     for c in range(3):
         expect(f.h, c, own[FIX + c], level * own[FIX_VARIANCE + c])
     q = innovate(f.g, f.h)
@@ -411,7 +413,7 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
             fix_terms(f, 0)
             q = innovate(f.g, f.h)
     spoken = speak_for(f, model, own, rows, count, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
-    use_fix(f, model, 0, True, q, spoken >= 0.0)
+    use_fix(f, model, 0, True, q, spoken >= 0.0, may_slip(own, FIX_VARIANCE, way * way))
     corrected(f)
 
 

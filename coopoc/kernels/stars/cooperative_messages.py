@@ -189,7 +189,8 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
         known = again and f.member[k, EXTRA_VARIANCE] == 0.0
         if known and status[TRUSTED] > 0.0 and sum(f.h.block[MEASURED:]) == 3:
             learn_fix(f, model, MESSAGES)
-        use_fix(f, model, k, again, q, True)
+        way = vector_at(f.member[k], WAY // 3)
+        use_fix(f, model, k, again, q, True, may_slip(rows[row], TYPICAL, inner_product(way, way)))
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
@@ -242,15 +243,22 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     return bool(age > ROUNDING)
 
 
+@part
+def may_slip(row: Floats, variance: int, way2: float) -> float:
+    """m^2, variance of what slipping may add: that of half a way, squared m^2, since the last fix, SLIP_M2 at most; and
+    no less than a fix's own, which stands in the row."""
+    return max(min(0.25 * way2, SLIP_M2), min(sum(vector_at(row, variance // 3)) / 3.0, SLIP_M2))
+
+
 @inner
-def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> None:
+def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool, slip: float) -> None:
     """Update by the rows of a vehicle's fix, and count those that are rejected in a row."""
-    f.member[k, OUT + 3] = share = update_by_fix(f, model, k, again, q, supported)
+    f.member[k, OUT + 3] = share = update_by_fix(f, model, k, again, q, supported, slip)
     f.who[k, REJECTED] = f.who[k, REJECTED] + 1 if share < 1.0 else 0
 
 
 @inside
-def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool) -> float:
+def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool, slip: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs more than assumed; the share of its information
     that it keeps. Causes of receiver errors last, so the n-th fix in a row beyond the gate counts 1 / n; a neighbour's
     does so where two others are trusted.
@@ -262,6 +270,7 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         again: whether it is not the vehicle's first one.
         q: of `innovate`.
         supported: whether nothing speaks against the estimate, and for the fix.
+        slip: of `may_slip`.
     """
     g, h, j, used = f.g, f.h, f.who[k, VEHICLE], sum(f.h.block[MEASURED:])
     if f.member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
@@ -283,7 +292,7 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
             correct(g, h, 1.0)
         return 0.0 if supported else 1.0
     gap = vector_at(h.three, GAP // 3)
-    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / SLIP_M2)
+    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / slip)
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
