@@ -107,8 +107,7 @@ def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path, truth):
     ahead_of, one, left, other, *_ = map(float, re.findall(r"-?\d+\.\d+", line))
     assert_allclose([ahead_of, left], arm, atol=4 * max(one, other))
     assert max(one, other) < (0.1 if truth else 0.3)
-    log = load_log(f"{tmp_path}?{line.split()[-4]}")
-    assert "antenna=" not in said(log)
+    assert "antenna=" not in said(load_log(f"{tmp_path}?{line.split()[-4]}"))
 
 
 def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path):

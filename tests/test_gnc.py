@@ -77,16 +77,14 @@ def test_wrong_loop_closures_are_those_that_gtsam_finds():
     """Poses in the plane, against BetweenFactorPose2 under GncLMOptimizer."""
     rng = np.random.default_rng(4)
     turn, std = [0, 0, 0, np.pi / 2] * 5, np.array([0.1, 0.1, 0.02])
-    poses = [gtsam.Pose2(0, 0, 0)]
-    for angle in turn:
-        poses.append(poses[-1].compose(gtsam.Pose2(2.0, 0, angle)))
+    steps = (gtsam.Pose2(2.0, 0, angle) for angle in turn)
+    poses = [*itertools.accumulate(steps, gtsam.Pose2.compose, initial=gtsam.Pose2())]
     noisy = lambda p: p.compose(gtsam.Pose2(*rng.normal(0, std)))  # noqa: E731
     edges = [(k, k + 1) for k in range(20)] + [(0, 16), (1, 17), (2, 18), (4, 20), (3, 12), (5, 14), (7, 19)]
     measured = [noisy(poses[i].between(poses[j])) for i, j in edges]
     measured[-3:] = [noisy(gtsam.Pose2(1, 0, 0.3)) for _ in range(3)]
-    start, graph, guess = [poses[0]], gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for step in measured[:20]:
-        start.append(start[-1].compose(step))
+    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    start = [*itertools.accumulate(measured[:20], gtsam.Pose2.compose, initial=poses[0])]
     written = lambda p: pose([p.x(), p.y()], p.theta())  # noqa: E731
     model = gtsam.noiseModel.Diagonal.Sigmas(std)
     graph.add(gtsam.PriorFactorPose2(0, poses[0], model))

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -21,10 +20,9 @@ from coopoc.optimize.model.problem import Search
 
 def ranged(seed: int) -> Problem:
     """Eight points in space from random starts: three have a fix, and all ranges between them are measured."""
-    rng = np.random.default_rng(seed)
-    truth, pairs = rng.uniform(-20, 20, (8, 3)), list(combinations(range(8), 2))
-    x0 = rng.uniform(-20, 20, (8, 3))
-    z = np.array([[np.linalg.norm(truth[j] - truth[i]) + rng.normal(0, 0.1)] for i, j in pairs])
+    rng, pairs = np.random.default_rng(seed), np.column_stack(np.triu_indices(8, 1))
+    truth, x0 = rng.uniform(-20, 20, (2, 8, 3))
+    z = np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)) + rng.normal(0, 0.1, 28)
     fixes = truth[:3] + rng.normal(0, 0.3, (3, 3))
     alone = Search("random", x0=x0)
     problem = Problem([f"v{k}" for k in range(8)], x0=x0, search=alone).add("position", range(3), fixes, std=0.3)
