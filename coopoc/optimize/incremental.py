@@ -19,8 +19,10 @@ from .solve import solve
 from .starts.initial import initial_guess
 
 LOOSE = 1e6
-"""m, standard deviation of a prior that iSAM2 alone has on each new point, which one range leaves free: so vague that
-measurements decide wherever the first guess was."""
+"""m, standard deviation of a prior that iSAM2 alone has on a new point that nothing measures."""
+VAGUE = 1e-6
+"""Information of one on a new point that its first measurements leave free, as a range does, as a share of what they
+tell of its best known direction: with less of it, GTSAM's Cholesky takes a pivot for zero."""
 
 
 class Incremental:
@@ -122,24 +124,44 @@ class Incremental:
             lost = ", ".join(names[k] for k in free[:5])
             raise InputError("factors", f"leave {lost} free", "must hold every new pose", "Add a relative pose.")
         graph, guess = graph_of(part, stated, keys), values(part.space, turns, x, first)
-        for k in np.flatnonzero(~np.array(turns, dtype=bool)).tolist():
-            vague = gtsam.noiseModel.Isotropic.Sigma(d, LOOSE)
-            graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](first + k, x[k, :d], vague))
+        for k, information in self._vague(part, keys, first, x, turns):
+            vague = gtsam.noiseModel.Isotropic.Precision(d, information)
+            graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](k, x[k - first, :d], vague))
         used = [dict.fromkeys([*keys, *guess.keys()], float(self._steps))] if self.lag else []
-        count = self._graph().size() if self.lag else self._slots  # of iSAM2 alone a copy of all factors
-        try:
-            self.isam.update(graph, guess, *used)
-        except RuntimeError as error:
-            self._restore(count, range(first, first + len(x)))
-            said = shown(" ".join(str(error).split()), 200)
-            raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
+        for again in (False, True):
+            count = self._graph().size() if self.lag else self._slots  # of iSAM2 alone a copy of all factors
+            try:
+                self.isam.update(graph, guess, *used)
+                break
+            except RuntimeError as error:
+                self._restore(count, range(first, first + len(x)))
+                if again:
+                    said = shown(" ".join(str(error).split()), 200)
+                    raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
         self._steps, self._slots = self._steps + 1, count + graph.size()
+
+    def _vague(
+        self, part: Problem, keys: Sequence[int], first: int, x: Floats, turns: Sequence[bool]
+    ) -> list[tuple[int, float]]:
+        """New points that the factors of a step leave free, and the information of their priors, 1/m^2."""
+        known, d = np.zeros((len(x), part.dimension, part.dimension)), part.dimension
+        if all(turns):
+            return []
+        here = np.array([x[k - first] if k >= first else self[int(k)] for k in keys]).reshape(-1, part.space.ambient)
+        for factor, slots in zip(part.factors, part.linearise(here).jacobian, strict=True):
+            for nodes, J in zip(np.asarray(keys)[factor.nodes.T], slots, strict=True):
+                new = nodes >= first
+                np.add.at(known, nodes[new] - first, (np.swapaxes(J, 1, 2) @ J)[new, :d, :d])
+        least, most = np.linalg.eigvalsh(np.nan_to_num(known))[:, [0, -1]].T
+        free = ~np.array(turns) & (least <= VAGUE * most)
+        return [(first + k, VAGUE * most[k] or LOOSE**-2) for k in np.flatnonzero(free).tolist()]
 
     def _graph(self) -> Any:
         return self.isam.getFactors() if self.lag else self.isam.getFactorsUnsafe()
 
     def _restore(self, count: int, new: Iterable[int]) -> None:
-        """iSAM2 anew from its first `count` factors and without new nodes: a step that failed has left it between."""
+        """iSAM2 anew from its first `count` factors and without new nodes, by QR, which takes no small pivot for zero: a
+        step that failed has left it between."""
         import gtsam
 
         graph, old, guess = gtsam.NonlinearFactorGraph(), self._graph(), gtsam.Values(self.isam.getLinearizationPoint())
@@ -150,6 +172,7 @@ class Incremental:
         for key in filter(guess.exists, new):
             guess.erase(key)
         params, used = self.isam.params(), list[Any]()
+        params.setFactorization("QR")
         if self.lag:
             used = [{key: at for key, at in self.isam.timestamps().items() if guess.exists(key)}]
         self.isam = gtsam.IncrementalFixedLagSmoother(self.lag, params) if self.lag else gtsam.ISAM2(params)
@@ -236,7 +259,7 @@ def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Increment
         problem: the first nodes, with an x0 where there are poses.
         lag: steps after which a node that is used no more is forgotten, its information kept (GTSAM's
             IncrementalFixedLagSmoother); then there is no `update`. 0 for never.
-        params: gtsam.ISAM2Params; None: GTSAM's own, with QR, which takes no small pivot for zero.
+        params: gtsam.ISAM2Params; None: GTSAM's own.
 
     References:
         Kaess et al., iSAM2: incremental smoothing and mapping using the Bayes tree, IJRR 2012.
@@ -255,9 +278,6 @@ def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Increment
     if problem.constraints:
         hint = "Leave them out, or solve() with them."
         raise InputError("problem", f"with {len(problem.constraints)} constraints", "must have none", hint)
-    if params is None:
-        params = gtsam.ISAM2Params()
-        params.setFactorization("QR")
-    instance("params", params, gtsam.ISAM2Params)
+    params = instance("params", gtsam.ISAM2Params() if params is None else params, gtsam.ISAM2Params)
     number("lag", lag, 0, kind=int, allowed="a whole number >= 0", hint="0 forgets nothing.")
     return Incremental(problem, gtsam.IncrementalFixedLagSmoother(lag, params) if lag else gtsam.ISAM2(params), lag)

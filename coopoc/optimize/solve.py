@@ -262,14 +262,14 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
     if truth.unobservable:
         return Status.RANK_DEFICIENT
     still = truth.remaining <= POSITION_TOLERANCE
-    if not (still or truth.predicted <= DECREASE * truth.cost):
+    if not (still or truth.predicted <= DECREASE * max(truth.cost, 1.0)):
         return Status.FAILED
     if truth.active is not None:
         return Status.SOLVED if is_constrained_minimum(problem, x, truth.active) else Status.SADDLE
     left = newton_decrease(problem, x)
     if left is None:
         return Status.SADDLE
-    return Status.SOLVED if left <= max(DECREASE * truth.cost, NEWTON_DECREASE * still) else Status.FAILED
+    return Status.SOLVED if left <= max(DECREASE * max(truth.cost, 1.0), NEWTON_DECREASE * still) else Status.FAILED
 
 
 def _raise(solution: Solution) -> None:

@@ -6,7 +6,7 @@ from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..model.derivatives import linearise
-from ..model.factor import Factor, as_factor, bounded, unchecked
+from ..model.factor import Factor, as_factor, bounded, stacked, unchecked
 from ..model.measurements import converted_rows
 from ..model.problem import Problem
 
@@ -52,7 +52,7 @@ def directed(problem: Problem, x: Floats) -> Floats:
         if not lost:
             break
         step = np.zeros(movable.shape)
-        nodes = np.unique(np.concatenate(lost))
+        nodes = np.unique(stacked(each.ravel() for each in lost))
         step[nodes] = NUDGE_STD * rng.normal(size=(len(nodes), movable.shape[1]))
         x = problem.space.retract(x, step * movable)
     return x
