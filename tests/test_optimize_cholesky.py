@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.sparse import csc_matrix, triu
+from scipy.sparse import csc_matrix, identity, triu
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from coopoc.kernels.graphs import multifrontal
 from coopoc.kernels.graphs.multifrontal import supernodes
-from coopoc.optimize.algebra.cholesky import Cholesky
+from coopoc.optimize.algebra.cholesky import Cholesky, eliminated
 from coopoc.workers import one_thread
 
 
@@ -65,6 +66,15 @@ def test_parts_that_nothing_joins_are_factored_apart():
     cholesky = Cholesky(pattern.indptr, pattern.indices)
     assert cholesky.factor(pattern.data)
     assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(A[np.ix_(order, order)], rhs), rel=1e-8)
+
+
+def test_near_places_are_dissected():
+    """Minimum degree takes 9.5e6; nothing joins the last node."""
+    at = np.random.default_rng(0).uniform(0, 44.7, (2000, 2))
+    pairs = cKDTree(at).query_pairs(3.0, output_type="ndarray")
+    joined = csc_matrix((np.ones(len(pairs)), pairs.T), (2001, 2001))
+    _, lower = eliminated(joined + joined.T + identity(2001), 3.0)
+    assert np.square(np.diff(lower.indptr)).sum() < 8e6
 
 
 def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():

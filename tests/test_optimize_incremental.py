@@ -5,6 +5,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from conftest import refused
 
 import coopoc as co
 from coopoc.optimize import Incremental, Loss, joint_covariance
@@ -33,7 +34,6 @@ def followed(loss: Loss | None = None, lag: int = 0) -> Incremental:
     often = gtsam.ISAM2Params()
     often.setRelinearizeThreshold(0.01)
     often.relinearizeSkip = 1
-    often.setFactorization("QR")
     live = co.incremental(start.add("pose", "x0", our_pose(TRUE[0]), std=0.01), lag, often)
     at = TRUE[0]
     for step, (k, mark, distance) in zip(moved, far, strict=True):
@@ -103,9 +103,11 @@ def test_a_guess_has_no_weight(z, std):
 @pytest.mark.parametrize("lag", [0, 8])
 def test_a_step_that_isam2_cannot_take_is_undone(lag, monkeypatch):
     live, new = followed(lag=lag), {"x25": our_pose(TRUE[24])}
+    live.add(values={"l9": [9.0, 0.0]})
+    live.add([("range", ("x24", "l9"), 3.0, 0.1)])  # Cholesky takes a pivot for zero, and QR follows
     before, marginal = live["x24"], live.marginal("x24")
     monkeypatch.setattr(Incremental, "_free", lambda *_: [])
-    with pytest.raises(co.InputError, match="Indeterminate"):
+    with refused("Indeterminate"):
         live.add([("range", ("x24", "x25"), 1.0, 0.1)], new)
     assert live["x24"] == pytest.approx(before, abs=1e-6)
     assert live.marginal("x24") == pytest.approx(marginal, rel=1e-3)
@@ -125,9 +127,9 @@ def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told():
     exact = gtsam.Marginals(graph, best).marginalCovariance(24)
     assert np.trace(live.marginal("x24")) == pytest.approx(np.trace(exact), rel=0.05)
     assert len(live.isam.calculateEstimate().keys()) < 13
-    with pytest.raises(co.InputError, match="lag"):
+    with refused("lag"):
         live.update()
-    with pytest.raises(co.InputError, match="forgotten"):
+    with refused("forgotten"):
         live["x3"]
 
 
@@ -146,12 +148,12 @@ def test_what_is_refused_leaves_the_estimate_as_it_was():
         ([("range", ("x24", "l0"))], {}, "tuples"),
         ([], {7: [1.0, 0.0]}, "names of nodes"),
     ):
-        with pytest.raises(co.InputError, match=field):
+        with refused(field):
             live.add(factors, values)
     assert live.names == names
     assert (live.x == before).all()
     problem = co.Problem(("a",), dimension=2).add("position", "a", [0, 0], std=1.0)
-    with pytest.raises(co.InputError, match="1 constraints"):
+    with refused("1 constraints"):
         co.incremental(problem.constrain("position", "a", lower=0.0))
-    with pytest.raises(co.InputError, match="params"):
+    with refused("params"):
         co.incremental(problem, params={"relinearizeSkip": 1})

@@ -70,11 +70,12 @@ ANCHORS = np.array([[0, 0], [10, 0.0]])
 
 
 def test_a_saddle_between_two_anchors_is_one():
-    """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line."""
+    """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line, of 4 and 6 m on it."""
     problem = ranged(ANCHORS, np.array([5, 0.0]), np.full(2, 15.0), 1.0)
     found = solve(problem, throw=False)
     assert found.status is Status.SADDLE
     assert "this minimum" not in str(found.notes)
+    assert solve(ranged(ANCHORS, np.array([4, 0.1]), np.array([4.0, 6.0]), 0.1)).status is Status.SOLVED
     unknown = ranged(np.zeros((1, 2)), np.array([3, 4.0]), np.array([5.0]), 1.0)
     assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
 

@@ -1,7 +1,7 @@
 """Live estimation: GTSAM's iSAM2 follows the measurements, and `solve` checks where it has led."""
 
 from collections import ChainMap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,10 +19,11 @@ from .solve import solve
 from .starts.initial import initial_guess
 
 LOOSE = 1e6
-"""m, standard deviation of a prior that iSAM2 alone has on a new point that nothing measures."""
+"""m, standard deviation of a prior that iSAM2 alone has on each new point: so vague that measurements decide wherever
+the first guess was."""
 VAGUE = 1e-6
-"""Information of one on a new point that its first measurements leave free, as a range does, as a share of what they
-tell of its best known direction: with less of it, GTSAM's Cholesky takes a pivot for zero."""
+"""Information of the prior of one that its first measurements leave free, as a range does, as a share of what they tell
+of its best known direction: with less of it, GTSAM's Cholesky takes a pivot for zero."""
 
 
 class Incremental:
@@ -39,9 +40,9 @@ class Incremental:
 
     def __init__(self, problem: Problem, isam: Any, lag: int) -> None:
         self.names, self.isam, self._problem, self._factors = list(problem.names), isam, problem, list(problem.factors)
-        self.lag, self._steps, self._slots = lag, 0, 0
+        self.lag, self._steps = lag, 0
         self._place, self._poses = {name: k for k, name in enumerate(self.names)}, {*problem.poses}
-        self._step(problem, range(len(self.names)), 0, initial_guess(problem), which_turn(problem), self.names)
+        self._step(problem, range(len(self.names)), initial_guess(problem))
 
     def add(
         self,
@@ -60,7 +61,7 @@ class Incremental:
                 that nothing holds; the estimate is as before.
         """
         space, first, new = self._problem.space, len(self.names), dict(values or {})
-        d, x, turns = space.dimension, np.zeros((len(new), space.ambient)), list[bool]()
+        d, x, late_poses = space.dimension, np.zeros((len(new), space.ambient)), set[int]()
         for k, (name, value) in enumerate(new.items()):
             if not isinstance(name, str):
                 raise InputError("values", shown(name), "must have names of nodes", "Give a str.")
@@ -70,8 +71,9 @@ class Incremental:
             if len(vector) not in (d, space.ambient):
                 allowed = f"must be {d} numbers of a point or {space.ambient} of a pose"
                 raise InputError("values", f"{name}: {len(vector)} numbers", allowed, "Make poses with coopoc.pose.")
-            turns.append(space.has_rotation and len(vector) > d)
-            x[k] = vector if turns[-1] else space.join(vector[None, :d])[0]
+            if turned := space.has_rotation and len(vector) > d:
+                late_poses.add(first + k)
+            x[k] = vector if turned else space.join(vector[:d])
         points(space, len(x), "values", x)
         every, fresh = [*self.names, *new], {name: first + k for k, name in enumerate(new)}
         index_of_name = ChainMap(fresh, self._place)
@@ -90,84 +92,71 @@ class Incremental:
                 at = indices(index, kind, nodes)
                 each = Factor(kind, at, rows(kind, z, len(at)), *std)
             made.append(each)
-        used = np.unique(stacked(f.nodes.ravel() for f in made)).tolist()
+        used = np.unique(stacked([*(f.nodes.ravel() for f in made), np.arange(first, len(every))])).tolist()
         names = [every[index(k)] for k in used]
-        late_poses = {first + k for k, turned in enumerate(turns) if turned}
         poses = [k for k, node in enumerate(used) if node in self._poses or node in late_poses]
         local = [unchecked(f, nodes=np.searchsorted(used, f.nodes)) for f in made]
         part = Problem(tuple(names), local, dimension=d, poses=tuple(poses))
         part.__dict__["space"] = space
-        self._step(part, used, first, x, turns, every)
+        self._step(part, used, x)
         self._poses |= late_poses
         self._place.update(fresh)
         self.names = every
         self._factors += made
 
-    def _step(
-        self,
-        part: Problem,
-        keys: Sequence[int],
-        first: int,
-        x: Floats,
-        turns: Sequence[bool],
-        names: Sequence[str],
-    ) -> None:
-        """iSAM2's step with the factors of a problem, whose nodes have these keys, and new nodes from `first` on."""
+    def _step(self, part: Problem, keys: Sequence[int], x: Floats) -> None:
+        """iSAM2's step with the factors of a problem, whose nodes have these keys; the last ones, at x, are new."""
         import gtsam
 
-        stated, d = forms(part), part.dimension
-        for factor, form in zip(part.factors, stated, strict=True):
-            if form is None:
-                hint = "relative_pose_log takes any covariance and loss; solve() takes all."
-                raise InputError("factors", repr(factor), "must be one that GTSAM has a factor for", hint)
-        if free := self._free(part, keys, first, x, turns):
-            lost = ", ".join(names[k] for k in free[:5])
-            raise InputError("factors", f"leave {lost} free", "must hold every new pose", "Add a relative pose.")
-        graph, guess = graph_of(part, stated, keys), values(part.space, turns, x, first)
-        for k, information in self._vague(part, keys, first, x, turns):
-            vague = gtsam.noiseModel.Isotropic.Precision(d, information)
-            graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](k, x[k - first, :d], vague))
-        used = [dict.fromkeys([*keys, *guess.keys()], float(self._steps))] if self.lag else []
+        stated, old = forms(part), len(keys) - len(x)
+        if None in stated:
+            lacking, allowed = repr(part.factors[stated.index(None)]), "must be one that GTSAM has a factor for"
+            hint = "relative_pose_log takes any covariance and loss; solve() takes all."
+            raise InputError("factors", lacking, allowed, hint)
+        if free := ", ".join(self._free(part, keys, x)[:5]):
+            raise InputError("factors", f"leave {free} free", "must hold every new pose", "Add a relative pose.")
+        graph, guess = graph_of(part, stated, keys), values(part.space, which_turn(part)[old:], x, *keys[old:][:1])
+        for key, place, information in self._vague(part, keys, x):
+            vague = gtsam.noiseModel.Isotropic.Precision(len(place), information)
+            graph.add(gtsam.__dict__[f"PriorFactorPoint{len(place)}"](key, place, vague))
+        used = [dict.fromkeys(keys, float(self._steps))] if self.lag else []
         for again in (False, True):
-            count = self._graph().size() if self.lag else self._slots  # of iSAM2 alone a copy of all factors
+            count = self._graph().size()
             try:
                 self.isam.update(graph, guess, *used)
                 break
             except RuntimeError as error:
-                self._restore(count, range(first, first + len(x)))
+                self._restore(count, keys[old:])
                 if again:
                     said = shown(" ".join(str(error).split()), 200)
                     raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
-        self._steps, self._slots = self._steps + 1, count + graph.size()
+        self._steps += 1
 
-    def _vague(
-        self, part: Problem, keys: Sequence[int], first: int, x: Floats, turns: Sequence[bool]
-    ) -> list[tuple[int, float]]:
-        """New points that the factors of a step leave free, and the information of their priors, 1/m^2."""
-        known, d = np.zeros((len(x), part.dimension, part.dimension)), part.dimension
-        if all(turns):
-            return []
-        here = np.array([x[k - first] if k >= first else self[int(k)] for k in keys]).reshape(-1, part.space.ambient)
-        for factor, slots in zip(part.factors, part.linearise(here).jacobian, strict=True):
-            for nodes, J in zip(np.asarray(keys)[factor.nodes.T], slots, strict=True):
-                new = nodes >= first
-                np.add.at(known, nodes[new] - first, (np.swapaxes(J, 1, 2) @ J)[new, :d, :d])
-        least, most = np.linalg.eigvalsh(np.nan_to_num(known))[:, [0, -1]].T
-        free = ~np.array(turns) & (least <= VAGUE * most)
-        return [(first + k, VAGUE * most[k] or LOOSE**-2) for k in np.flatnonzero(free).tolist()]
+    def _vague(self, part: Problem, keys: Sequence[int], x: Floats) -> Iterator[tuple[int, Floats, float]]:
+        """Keys and places of new points, and the information of their priors, 1/m^2."""
+        points = np.setdiff1d(np.arange(len(keys) - len(x), len(keys)), part.poses)
+        if len(points):
+            at, d, dof = self._at(keys, x), part.dimension, part.space.dof
+            J = part.whiten(at)[1].tocsc()
+        for k in points.tolist():
+            own = J[:, k * dof : k * dof + d]
+            least, *_, most = np.linalg.eigvalsh(np.nan_to_num((own.T @ own).toarray())).tolist()
+            yield keys[k], at[k, :d], max(VAGUE * most * (least <= VAGUE * most), LOOSE**-2)
+
+    def _at(self, keys: Sequence[int], x: Floats) -> Floats:
+        """(n, ambient) nodes with these keys, the last of which are new."""
+        return np.reshape([*map(self.__getitem__, keys[: len(keys) - len(x)]), *x], (len(keys), -1))
 
     def _graph(self) -> Any:
         return self.isam.getFactors() if self.lag else self.isam.getFactorsUnsafe()
 
     def _restore(self, count: int, new: Iterable[int]) -> None:
-        """iSAM2 anew from its first `count` factors and without new nodes, by QR, which takes no small pivot for zero: a
+        """iSAM2 anew from its first `count` factors, without new nodes, by QR, which takes no small pivot for zero: a
         step that failed has left it between."""
         import gtsam
 
         graph, old, guess = gtsam.NonlinearFactorGraph(), self._graph(), gtsam.Values(self.isam.getLinearizationPoint())
-        kept = [k for k in range(count) if old.exists(k)]
-        self._slots = len(kept)
-        for k in kept:
+        for k in filter(old.exists, range(count)):
             graph.add(old.at(k))
         for key in filter(guess.exists, new):
             guess.erase(key)
@@ -178,24 +167,21 @@ class Incremental:
         self.isam = gtsam.IncrementalFixedLagSmoother(self.lag, params) if self.lag else gtsam.ISAM2(params)
         self.isam.update(graph, guess, *used)
 
-    def _free(self, part: Problem, keys: Sequence[int], first: int, x: Floats, turns: Sequence[bool]) -> list[int]:
+    def _free(self, part: Problem, keys: Sequence[int], x: Floats) -> list[str]:
         """New poses that the factors of a step leave free where older nodes are known, and new points to LOOSE: only
         of those that no whole relative poses hold the null space is looked at."""
-        d, older = part.dimension, [k for k, key in enumerate(keys) if key < first]
+        d, older = part.dimension, range(len(keys) - len(x))
         held = {*older, *part.fixed}
         for factor in part.factors:
             if factor.measurement.compares_poses:
                 for nodes in factor.nodes[factor.measured == factor.size].tolist():
                     held.update(nodes if len(nodes) == 1 or not held.isdisjoint(nodes) else [])
-        loose = {first + k for k, turned in enumerate(turns) if turned} - {keys[k] for k in held}
+        loose = {part.names[k] for k in {*part.poses} - held}
         if loose:
-            here = [x[k - first] if k >= first else self[int(k)] for k in keys]
-            at = np.array(here).reshape(len(keys), part.space.ambient)
-            points = np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
+            at, points = self._at(keys, x), np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
             vague = [Factor("position", points[:, None], at[points, :d], std=np.full(d, LOOSE))] if len(points) else []
             old_fixed = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
-            free = [keys[part.index(name)] for name in assess(old_fixed, at, covariance=False).unobservable]
-            loose &= {*free} | (loose - {*keys})
+            loose.intersection_update(assess(old_fixed, at, covariance=False).unobservable)
         return sorted(loose)
 
     def __contains__(self, node: str) -> bool:

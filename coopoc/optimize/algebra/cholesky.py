@@ -10,6 +10,9 @@ from ...workers import one_thread
 
 THREADED_UNKNOWNS = 64
 """Unknowns from which BLAS shares matrices among threads."""
+DISSECTED_WORK, DISSECTED_NODES = 50_000, 2000
+"""Multiplications per node, of so many nodes at least, from which nested dissection is tried beside minimum degree: it
+takes as long as they do in a few factorisations."""
 
 
 def _unshared(size: int) -> Any:
@@ -32,31 +35,29 @@ class Cholesky:
     """
 
     def __init__(self, indptr: Ints, indices: Ints, group: Ints | None = None) -> None:
-        from ...kernels.graphs.multifrontal import factorise, places, selected_inverse, solved
+        from ...kernels.graphs import multifrontal
 
-        # to import them again at each call takes as long as to factor a star
-        self._factorise, self._solved = factorise, solved
-        self._places, self._selected_inverse = places, selected_inverse
+        self._kernels = multifrontal  # to import it again at each call takes as long as to factor a star
         size = len(indptr) - 1
         self._fronts = analysed(indptr, indices, np.arange(size) if group is None else group)
         self._rank = np.argsort(self._fronts.order)
         column = np.repeat(np.arange(size), np.diff(indptr))
-        self._place = places(self._fronts, self._rank[indices], self._rank[column])
+        self._place = multifrontal.places(self._fronts, self._rank[indices], self._rank[column])
         self._factor = np.empty(int(self._fronts.start[-1]))
 
     def factor(self, values: Floats) -> bool:
         """Factor an upper triangle's values; whether it is positive definite."""
         with _unshared(len(self._rank)):
-            return not len(values) or bool(self._factorise(self._fronts, self._place, values, self._factor))
+            return not len(values) or bool(self._kernels.factorise(self._fronts, self._place, values, self._factor))
 
     @property
     def pivots(self) -> Floats:
         """(u,) squares of L's diagonal."""
-        return np.square(self._factor[self._places(self._fronts, self._rank, self._rank)])
+        return np.square(self._factor[self._kernels.places(self._fronts, self._rank, self._rank)])
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        return self._solved(self._fronts, self._factor, rhs)
+        return self._kernels.solved(self._fronts, self._factor, rhs)
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
         """A^-1 at pairs of unknowns (K,), each of which A has an entry for.
@@ -64,8 +65,8 @@ class Cholesky:
         See `selected_inverse`; time and memory are those of the factor, not of the inverse.
         """
         with _unshared(len(self._rank)):
-            inverse = self._selected_inverse(self._fronts, self._factor)
-        return inverse[self._places(self._fronts, self._rank[rows], self._rank[columns])]
+            inverse = self._kernels.selected_inverse(self._fronts, self._factor)
+        return inverse[self._kernels.places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
 def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
@@ -101,10 +102,11 @@ def with_still(matrix: Any, added: Floats | Bools) -> Any:
 
 
 def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
-    """Fronts of a pattern, its groups of unknowns in the order of approximate minimum degree.
+    """Fronts of a pattern, its groups of unknowns in the order of approximate minimum degree or of nested dissection.
 
     References:
-        Amestoy, Davis, Duff, An approximate minimum degree ordering algorithm, SIAM J. Matrix Anal. 1996.
+        Amestoy, Davis, Duff, An approximate minimum degree ordering algorithm, SIAM J. Matrix Anal. 1996; Karypis,
+        Kumar, A fast and high quality multilevel scheme for partitioning irregular graphs, SIAM J. Sci. Comput. 1998.
     """
     from scipy.sparse import csc_array, csr_array
 
@@ -114,7 +116,7 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     u, n = len(group), len(width)
     of = csr_array((np.ones(u), np.repeat(np.arange(n), width), np.arange(u + 1)), shape=(u, n))
     upper = of.T @ csc_array((np.ones(len(indices)), indices, indptr), shape=(u, u)) @ of
-    order, lower = eliminated((upper + upper.T).tocsc())
+    order, lower = eliminated((upper + upper.T).tocsc(), u / max(n, 1))
     later = postorder(_parents(lower), np.diff(lower.indptr).astype(np.int64))
     order, lower = order[later], lower[later][:, later]
     lower.sort_indices()
@@ -133,17 +135,44 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     )
 
 
-def eliminated(pattern: Any) -> tuple[Ints, Any]:
-    """The order (n,) in which CasADi's AMD eliminates nodes of a symmetric pattern, and L's below the diagonal in that
-    order, CSR of its transpose: the rows of each column, ascending, the first of which is its parent in the elimination
-    tree."""
+def eliminated(pattern: Any, unknowns: float) -> tuple[Ints, Any]:
+    """The order (n,) in which nodes of a symmetric pattern, of so many `unknowns`, are eliminated, and L's below the
+    diagonal in that order, CSR of its transpose: the rows of each column, ascending, the first of which is its parent
+    in the elimination tree."""
+    found = _filled(pattern, True)
+    if _work(found) * unknowns**3 > DISSECTED_WORK * max(pattern.shape[0], DISSECTED_NODES):
+        order = _dissected(pattern)
+        found = min(found, (order, _filled(pattern[order][:, order].sorted_indices(), False)[1]), key=_work)
+    return found
+
+
+def _filled(pattern: Any, by_degree: bool) -> tuple[Ints, Any]:
+    """Order and L of `eliminated`, by CasADi's AMD or as the nodes come."""
     import casadi as ca
     from scipy.sparse import csc_array
 
     n = pattern.shape[0]
-    upper, order = ca.Sparsity(n, n, pattern.indptr.tolist(), pattern.indices.tolist()).ldl()
+    upper, order = ca.Sparsity(n, n, pattern.indptr.tolist(), pattern.indices.tolist()).ldl(by_degree)
     indptr, indices = upper.get_ccs()
     return np.array(order, dtype=np.int64), csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n)).tocsr()
+
+
+def _work(found: tuple[Ints, Any]) -> float:
+    """Multiplications of a factorisation with one unknown per node."""
+    return float(np.square(np.diff(found[1].indptr) + 1.0).sum())
+
+
+def _dissected(pattern: Any) -> Ints:
+    """(n,) nodes in the order of METIS, which GTSAM has; last those alone, with which it writes beyond its memory."""
+    from gtsam import Ordering, SymbolicFactorGraph
+    from scipy.sparse import triu
+
+    graph, pairs = SymbolicFactorGraph(), triu(pattern, 1).tocoo()
+    for pair in zip(pairs.row.tolist(), pairs.col.tolist(), strict=True):
+        graph.push_factor(*pair)
+    found = Ordering.MetisSymbolicFactorGraph(graph)
+    order = [found.at(k) for k in range(found.size())]
+    return np.append(order, np.setdiff1d(np.arange(pattern.shape[0]), order)).astype(np.int64)
 
 
 def _parents(lower: Any) -> Ints:

@@ -67,19 +67,19 @@ def solver(
             "Leave out those that follow from the others.",
         )
     nlp = programme(form, int(max_iterations), get_ident())
-    space, free, count, rounds = form.space, form.movable, 0, 0
+    space, free, count = form.space, form.movable, 0
     multipliers: Any = 0.0
-    while rounds < 10:  # for poses again around the answer until it stays
+    for _ in range(10):  # for poses again around the answer until it stays
         end = nlp(p=_numbers(problem, x), lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
         status = stats["return_status"]
-        before, step, count, rounds = x, np.zeros(free.shape), count + int(stats["iter_count"]), rounds + 1
+        before, step, count = x, np.zeros(free.shape), count + int(stats["iter_count"])
         step[free] = at
         if np.isfinite(at).all():
             x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
         if not space.has_rotation or status in HOPELESS or np.abs(x - before).max(initial=0.0) <= tolerance:
             break
-    return SolverResult(x, count, status == HOPELESS[0], {"return_status": status, "rounds": rounds})
+    return SolverResult(x, count, status == HOPELESS[0], {"return_status": status})
 
 
 def _numbers(problem: Problem, x: Floats) -> Floats:

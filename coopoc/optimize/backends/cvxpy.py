@@ -1,8 +1,8 @@
 """cvxpy: Shor's semidefinite relaxation, rounded and refined; the extras hold its bound."""
 
 from ...arrays import Floats
-from ..backend import Backend, Capabilities, SolverResult
-from ..convex.qcqp import TERMS
+from ..backend import Backend, SolverResult
+from ..convex.qcqp import QUADRATIC
 from ..convex.relaxation import shor
 from ..model.problem import Problem
 
@@ -23,5 +23,5 @@ BACKEND = Backend(
     "cvxpy",
     solver,
     "cvxpy",
-    Capabilities(kinds=tuple(TERMS), losses=()),
+    QUADRATIC,
 )

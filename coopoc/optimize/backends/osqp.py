@@ -64,9 +64,9 @@ def solver(
         try:
             x, feasible = _nearest(problem, x)
         except np.linalg.LinAlgError:
-            return SolverResult(x, 0, extras=dict(programme.counts))
+            return SolverResult(x, 0)
         if not feasible:
-            return SolverResult(x, 0, True, dict(programme.counts))
+            return SolverResult(x, 0, True)
 
     def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
         sides = constraint_rows(problem, x).sides if held else (np.empty(0), np.empty(0))
@@ -76,7 +76,7 @@ def solver(
             return None
 
     end = arrive(system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, held)
-    return SolverResult(end.x, end.iterations, extras=dict(programme.counts))
+    return SolverResult(end.x, end.iterations, extras={"repairs": programme.repairs})
 
 
 class Infeasible(np.linalg.LinAlgError):
@@ -95,7 +95,7 @@ class Programme:
         self._pattern, self._rows = pattern, rows
         self._workspace: Any = None
         self._polishing = False
-        self.counts = {"osqp_iterations": 0, "repairs": 0}
+        self.repairs = 0
 
     def solve(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> tuple[Floats, float]:
         """dx for the values of the upper triangle of P, and y . C dx, the push of the bounds along it.
@@ -106,14 +106,13 @@ class Programme:
         self.update(values, q, lower, upper)
         for attempt in range(REPAIRS + 1):
             end = self._workspace.solve(raise_error=False)
-            self.counts["osqp_iterations"] += int(end.info.iter)
             if end.info.status.startswith("primal infeasible"):
                 raise Infeasible
             dx, y, value = np.array(end.x), np.array(end.y), self._rows @ end.x
             active = bool(np.any((upper - value < y) | (value - lower < -y)))
             if self._holds(values, q, lower, upper, dx, y) and self._polishing >= active:
                 return dx, float(y @ value)
-            self.counts["repairs"] += attempt < REPAIRS and self._polishing >= active
+            self.repairs += attempt < REPAIRS and self._polishing >= active
             self._polish(active)
         raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ...errors import InputError
+from ..backend import Capabilities
 from ..model.factor import Factor, stacked
 from ..model.problem import Problem
 from ..model.space import nearest_rotation
@@ -163,7 +164,12 @@ def quadratic(problem: Problem) -> Quadratic:
     >>> quadratic(problem.add("range", ("a", "b"), 5.0, std=0.5)).rows.shape
     (3, 6)
     """
-    _check(problem)
+    if not problem.factors:
+        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    if lacking := QUADRATIC.lacking(problem):
+        hint = "Use least squares of ranges and chords, or trust the curvature that `solve` checks."
+        allowed = f"is not quadratic: it must be one of {sorted(TERMS)}, without losses and constraints"
+        raise InputError("problem", f"with {', '.join(lacking)}", allowed, hint)
     d, n = problem.dimension, len(problem.names)
     world = [f for f in problem.factors if f.kind in WORLD]
     uneven = [f for f in world if f.kind != "pose_chordal" and one_weight(f.root) is None]
@@ -304,6 +310,8 @@ TERMS: dict[str, Callable[[_Rows, Factor], None]] = {
     "relative_pose_chordal": _relative,
 }
 """Measurements of this form."""
+QUADRATIC = Capabilities(kinds=tuple(TERMS), losses=())
+"""What has this form."""
 WORLD = ("position", "displacement", "pose_chordal")
 """Measurements in the world's frame."""
 
@@ -322,19 +330,6 @@ def one_weight(root: Floats) -> Floats | None:
     """(M,) w if every W (M, k, k) is w I, else None."""
     weight = root[:, 0, 0] if root.size else np.zeros(len(root))
     return weight if np.allclose(root, weight[:, None, None] * np.eye(root.shape[-1]), rtol=1e-9, atol=0.0) else None
-
-
-def _check(problem: Problem) -> None:
-    if not problem.factors:
-        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
-    if problem.constraints:
-        raise InputError("constraints", problem.constraints[0], "have no place in a relaxation", "Leave them out.")
-    for factor in problem.factors:
-        if factor.kind not in TERMS:
-            hint = "Measure ranges and chords, or trust the curvature that `solve` checks."
-            raise InputError("kind", repr(factor.kind), f"is not quadratic: it must be one of {sorted(TERMS)}", hint)
-        if factor.loss is not None:
-            raise InputError("loss", factor.loss.name, "is not quadratic: must be None", "Use least squares.")
 
 
 def _refuse(factor: Factor) -> NoReturn:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise, sparse_jacobian
-from .factor import Constraint, Factor, taken, unchecked
+from .factor import Constraint, Factor, stacked, taken, unchecked
 from .inputs import check_rotations
 from .measurements import lookup
 from .space import Space
@@ -244,7 +244,7 @@ class Problem:
         A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
         """
         linear = self.linearise(self._at(x))
-        return np.concatenate([r.ravel() for r in linear.residual]), self.jacobian(linear)
+        return stacked(r.ravel() for r in linear.residual), self.jacobian(linear)
 
     def jacobian(self, linear: Linear) -> Any:
         """Sparse Jacobian (rows, n dof) of `linearise`, CSR."""

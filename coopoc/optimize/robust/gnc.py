@@ -65,7 +65,7 @@ def solve_gnc(
 
     Returns:
         The Solution of the last weighted problem, whose cost, gradient and covariance are those of the weighted least
-        squares; iterations and times are of all rounds; extras has weights (M,), rounds and mu, and "joined", where
+        squares; iterations and times are of all rounds; extras has weights (M,), and "joined", where
         only candidates join parts: their first nodes, how many candidates agree on their place, how many agree on the
         best other place (rival), and how many there are.
 
@@ -112,22 +112,21 @@ def solve_gnc(
         s = marked.squares(at) / marked.bound
         return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ np.minimum(s, 1.0))
 
+    best, end = "known", None
     try:
-        from_known = known_start(marked, inner)
+        known = known_start(marked, inner)
     except InputError:  # known inliers leave nodes free, and candidates do not place them
         if start == "known":
             raise
-        from_known = None
-    best, before, end = "known", 0, None
-    if from_known is not None:
-        before, end = from_known.rounds, finish(from_known.x, from_known.weight)
-        extras |= {"joined": from_known.joined} if from_known.joined else {}
+    else:
+        end = finish(known.x, known.weight)
+        extras |= {"joined": known.joined} if known.joined else {}
     if end is None or (start == "any" and not explained(end)):
         best, x, graduation, doubts = contest(marked, inner, initial_guess(problem), lambda at: finish(at).x, cost)
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
     final = solve(marked.reweigh(end.weight, end.x), backend, throw=throw and end.settled, **options)
-    extras |= {"start": best, "weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
+    extras |= {"start": best, "weights": end.weight[marked.group]}
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < INLIER_WEIGHT).sum())
     notes = (rejection("GNC", out, len(end.weight), "candidates", final.cost, final.expected),) if out else ()

@@ -45,12 +45,10 @@ def weights(s: Floats, mu: float) -> Floats:
 
 
 class Graduation(NamedTuple):
-    """Where the loop ended: x (n, ambient), weight (G,), rounds, mu, and whether the weights settled."""
+    """Where the loop ended: x (n, ambient), weight (G,), and whether the weights settled."""
 
     x: Floats
     weight: Floats
-    rounds: int
-    mu: float
     settled: bool
 
 
@@ -64,12 +62,12 @@ def graduate(
     """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), mu and weight (G,),
     default ones, until all are 0 or 1."""
     weight = np.ones(len(marked.bound)) if weight is None else weight
-    for rounds in range(MAX_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         before, weight = weight, weights(marked.squares(x) / marked.bound, mu)
         if ((weight == before) & ((weight == 0.0) | (weight == 1.0))).all():
-            return Graduation(x, weight, rounds, mu, True)
+            return Graduation(x, weight, True)
         x, mu = inner(marked.reweigh(weight, x)), mu * MU_RATE
-    return Graduation(x, weight, MAX_ROUNDS, mu, False)
+    return Graduation(x, weight, False)
 
 
 def contest(
@@ -114,7 +112,7 @@ def contest(
         if bool((graduation.weight == 1.0).all()) and not higher(costs["graduated"], costs[best]):
             return "graduated", ends["graduated"], graduation, ()
         loose = movable(cauchy)
-        mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
+        mirrored_x, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
         places = islice(_places(cauchy, mirrored_x, loose), QUIET_DRAWS)
         best_x, tried = drawn(places, mirrored_x, lambda at: landed(soft(at)), cost, AGREEING_DRAWS)
         d, (lowest, _) = cauchy.dimension, min(tried, key=lambda end: end[0])
@@ -127,11 +125,8 @@ def contest(
             if len(loose):
                 again = graduate(marked, inner, best_x, first_mu(REGRADUATE_RATIO2))
                 best_x = min((best_x, landed(again.x)), key=cost)
-            best_x, moves, *_ = across(
-                truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
-            )
-            moved += moves
-    return name + ", moved" * (moved > 0), best_x, graduation, notes
+            best_x, *_ = across(truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost)
+    return name, best_x, graduation, notes
 
 
 def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:

@@ -99,14 +99,13 @@ class Decided:
         x: (n, ambient), each free body in a frame of its own.
         weight: (G,) of the candidates that have joined.
         left: (G,) how often each has left.
-        rounds: that it took.
         joined: for each body that candidates joined to another, how many agreed.
     """
 
     def __init__(self, marked: Marked) -> None:
         self.problem, self.marked, self.bound = marked.problem, marked, marked.bound
         self.weight, self.left = np.zeros(len(self.bound)), np.zeros(len(self.bound), dtype=np.int64)
-        self.rounds, self.joined = 0, tuple[dict[str, Any], ...]()
+        self.joined = tuple[dict[str, Any], ...]()
         self.x = along_poses(marked.reweigh(self.weight, initial_guess(self.problem)))
 
     def bodies(self) -> Ints:
@@ -136,9 +135,9 @@ class Decided:
         bound, weight, left, ends = self.bound, self.weight, self.left, self.ends(body)
         judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
         sparse(marked.problem)  # is kept as long as the problem is, so that all rounds share its analysis
-        most_joins, rounds = 1, 0
-        while rounds < 100:  # about 15 are needed: half of those that fit join in each
-            self.x, rounds = inner(marked.reweigh(weight, self.x)), rounds + 1
+        most_joins = 1
+        for _ in range(100):  # about 15 are needed: half of those that fit join in each
+            self.x = inner(marked.reweigh(weight, self.x))
             leaving = judged & (weight > 0) & (marked.squares(self.x) > bound)
             left[leaving], weight[leaving] = left[leaving] + 1, 0.0
             distance, volume = predicted(marked, weight, self.x)
@@ -153,7 +152,6 @@ class Decided:
                 some = some[np.argsort(-volume[some], kind="stable")][:MAX_RESOLVES]
                 if not any(self._explained(marked, group) for group in some.tolist()):
                     break
-        self.rounds += rounds
 
     def _explained(self, marked: Marked, group: int) -> bool:
         """Whether twice the cost grows by no more than the bound where a group joins, which it then does.

@@ -6,8 +6,7 @@ from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..model.derivatives import linearise
-from ..model.factor import Factor, as_factor, bounded, stacked, unchecked
-from ..model.measurements import converted_rows
+from ..model.factor import Factor, as_factor, bounded, stacked
 from ..model.problem import Problem
 
 NUDGE_STD = 0.1
@@ -17,7 +16,7 @@ RIDGE = 1e-9
 
 
 def initial_guess(problem: Problem) -> Floats:
-    """(n, ambient): x0 if the problem has one, else the linear solution of vectors, see `as_vectors`.
+    """(n, ambient): x0 if the problem has one, else the linear solution of vectors, see `converted_rows`.
 
     Raises:
         InputError: poses without an x0.
@@ -70,29 +69,3 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
         bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
         undefined += [(item, item.nodes[bad])] if bad.any() else []
     return undefined
-
-
-def somewhere(problem: Problem) -> Floats:
-    """(n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem."""
-    if problem.x0 is not None:
-        return initial_guess(problem)
-    x = np.zeros((len(problem.names), problem.dimension))
-    fixes = [f for f in problem.factors if f.kind == "position"]
-    if fixes:
-        x[:] = fixes[0].z[0]
-    for f in fixes:
-        x[f.nodes[:, 0]] = f.z
-    return x
-
-
-def as_vectors(factor: Factor) -> Factor:
-    """A spherical factor as one of vectors d u with the rotated covariance.
-
-    d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
-    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
-    """
-    d, rows = converted_rows([*factor.z.T], np)
-    inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    z, nothing = d[:, None] * inverse[:, 0], np.empty((len(factor.nodes), 0))
-    root = factor.root @ inverse
-    return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)

@@ -9,9 +9,10 @@ from ...arrays import Floats, Ints
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
 from ..model.factor import Factor
+from ..model.measurements import converted_rows
 from ..model.problem import Problem
 from .graph_starts import parts, walk, with_points
-from .initial import as_vectors, initial_guess
+from .initial import initial_guess
 
 FIELDS = {
     "pose": "pose_prior",
@@ -81,9 +82,12 @@ def _field(factor: Factor) -> str:
 
 def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
     """Values and covariances of a factor as a graph's edges have them, the same along all axes and about them."""
-    d, space = problem.dimension, problem.space
-    factor = as_vectors(factor) if factor.kind == "body_spherical" else factor
-    information, z = np.square(factor.root).sum(axis=1) + UNMEASURED_WEIGHT, factor.z
+    d, space, root, z = problem.dimension, problem.space, factor.root, factor.z
+    if factor.kind == "body_spherical":  # as vectors with the rotated covariance
+        distance, rows = converted_rows([*z.T], np)
+        axes = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        root, z = root @ axes, distance[:, None] * axes[:, 0]
+    information = np.square(root).sum(axis=1) + UNMEASURED_WEIGHT
     variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
     if factor.measurement.compares_poses:
         z = np.concatenate([space.position(z), to_orientation(space.rotation(z))], axis=1)
