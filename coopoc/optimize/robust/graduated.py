@@ -112,7 +112,7 @@ def contest(
         if bool((graduation.weight == 1.0).all()) and not higher(costs["graduated"], costs[best]):
             return "graduated", ends["graduated"], graduation, ()
         loose = movable(cauchy)
-        mirrored_x, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
+        mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
         places = islice(_places(cauchy, mirrored_x, loose), QUIET_DRAWS)
         best_x, tried = drawn(places, mirrored_x, lambda at: landed(soft(at)), cost, AGREEING_DRAWS)
         d, (lowest, _) = cauchy.dimension, min(tried, key=lambda end: end[0])
@@ -125,8 +125,11 @@ def contest(
             if len(loose):
                 again = graduate(marked, inner, best_x, first_mu(REGRADUATE_RATIO2))
                 best_x = min((best_x, landed(again.x)), key=cost)
-            best_x, *_ = across(truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost)
-    return name, best_x, graduation, notes
+            best_x, moves, *_ = across(
+                truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
+            )
+            moved += moves
+    return name + ", moved" * (moved > 0), best_x, graduation, notes
 
 
 def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
