@@ -24,7 +24,7 @@ def measured() -> tuple[list[gtsam.Pose2], list[tuple[int, str, float]]]:
 
 
 def our_pose(pose: gtsam.Pose2) -> np.ndarray:
-    return co.pose(np.array([pose.x(), pose.y()]), pose.theta())
+    return co.pose(pose.translation(), pose.theta())
 
 
 def followed(loss: Loss | None = None, lag: int = 0) -> Incremental:
@@ -135,7 +135,7 @@ def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told():
 
 def test_what_is_refused_leaves_the_estimate_as_it_was():
     live = followed()
-    before, names = live.x, list(live.names)
+    before = live.x
     new = {"x25": our_pose(TRUE[-1])}
     for factors, values, field in (
         ([("range", ("x25", "nowhere"), 1.0, 0.1)], new, "node"),
@@ -150,7 +150,6 @@ def test_what_is_refused_leaves_the_estimate_as_it_was():
     ):
         with refused(field):
             live.add(factors, values)
-    assert live.names == names
     assert (live.x == before).all()
     problem = co.Problem(("a",), dimension=2).add("position", "a", [0, 0], std=1.0)
     with refused("1 constraints"):

@@ -1,6 +1,6 @@
 """A graph of poses and landmarks as a Problem, and where to start it."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -146,11 +146,10 @@ def _counted(notes: Sequence[str]) -> list[str]:
     >>> _counted(["line 1: was repaired", "line 2: was repaired"])
     ['2 times, first in line 1: was repaired']
     """
-    first = dict[str, str]()
+    alike = defaultdict[str, list[str]](list)
     for note in notes:
-        first.setdefault(note.rpartition(": ")[2], note)
-    count = Counter(note.rpartition(": ")[2] for note in notes)
-    return [f"{count[what]} times, first in {note}" if count[what] > 1 else note for what, note in first.items()]
+        alike[note.rpartition(": ")[2]].append(note)
+    return [f"{len(each)} times, first in {each[0]}" if len(each) > 1 else each[0] for each in alike.values()]
 
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:

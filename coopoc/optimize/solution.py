@@ -106,8 +106,7 @@ class Solution:
         """(ambient,) estimate of a node by name; InputError that lists the names if there is none."""
         if not isinstance(point, str) or point not in self.names:
             raise no_such_node(point, self.names, "See solution.names.")
-        where: Floats = self.x[self.names.index(point)]
-        return where
+        return np.asarray(self.x[self.names.index(point)])
 
     def __str__(self) -> str:
         at = ", ".join(f"{v:.2f}" for v in self.position[self.shown])

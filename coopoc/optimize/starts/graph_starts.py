@@ -246,9 +246,7 @@ def contenders(graph: Graph) -> tuple[str, ...]:
     edges = graph.relative_pose.nodes
     loops = len(edges) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
     moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
-    if loops <= moved - 1:
-        return ("odometry", *from_file)
-    return ("tree", "odometry", *from_file)
+    return (*("tree",) * (loops >= moved), "odometry", *from_file)
 
 
 def _own(graph: Graph) -> Bools:
