@@ -181,7 +181,7 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
 
 
 def test_first_poses_come_from_ranges_alone():
-    """Landmarks far from the origin, without fixes and compass; the median was 1.34 m where ranges counted as linear."""
+    """Landmarks far from the origin, without fixes and compass; the median was 1.34 m with ranges taken as linear."""
     fleet = convoy(2, masts=5)
     fleet = replace(fleet, position=fleet.position + np.where(np.arange(7) % 2, 900.0, 920.0)[:, None])
     seen = observed(fleet, replace(WHITE, compass=False, gnss_std=(0.0,) * 3), runs=80, assumed=WHITE)
