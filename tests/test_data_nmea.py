@@ -367,5 +367,5 @@ def test_a_mistake_in_nmea_of_a_receiver(tmp_path, mistake):
             read_log(tmp_path)
     else:
         leap = mistake == "heights in feet"
-        words = r"0\.\d+ times as large as stated" + r"|AV_veh1: 1\.0% .* outliers" * leap
+        words = r"0\.\d+ times as large as stated" + r"|AV_veh1: 1\.\d% .* outliers" * leap
         assert all(re.search(words, warning) for warning in check(read_log(tmp_path)).warnings)
