@@ -247,7 +247,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
 def may_slip(row: Floats, variance: int, way2: float) -> float:
     """m^2, variance of what slipping may add: that of half a way, squared m^2, since the last fix, SLIP_M2 at most; and
     no less than a fix's own, which stands in the row."""
-    return max(min(0.25 * way2, SLIP_M2), min(sum(vector_at(row, variance // 3)) / 3.0, SLIP_M2))
+    return float(max(min(0.25 * way2, SLIP_M2), min(sum(vector_at(row, variance // 3)) / 3.0, SLIP_M2)))
 
 
 @inner
