@@ -131,6 +131,13 @@ def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
     return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
 
 
+def with_masts(fleet: Fleet, places: Any) -> Fleet:
+    """And landmarks m0, m1, ... at (M, 3) m."""
+    stand = np.broadcast_to(places, (len(fleet.t), *np.shape(places)))
+    position, velocity = (np.append(a, b, axis=1) for a, b in ((fleet.position, stand), (fleet.velocity, 0 * stand)))
+    return Fleet((*fleet.ids, *(f"m{k}" for k in range(len(places)))), fleet.t, position, velocity)
+
+
 def among(many: Links, few: Links) -> Bools:
     """Which links are also those of a recording with fewer neighbours."""
     keys = [links.step * 10**6 + links.observer * 1000 + links.neighbour for links in (many, few)]
@@ -143,6 +150,12 @@ def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None
     gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < share
     gone[:, 0] = False
     gnss[:, :, vehicles][gone[:, :, vehicles]] = np.nan
+    return replace(recording, gnss=gnss)
+
+
+def slow_fixes(recording: Recording, every: int = 10) -> Recording:
+    """A fix at every so many steps: at 1 Hz in data of 10 Hz."""
+    gnss = np.where(np.arange(len(recording.t))[:, None, None] % every, np.nan, recording.gnss)
     return replace(recording, gnss=gnss)
 
 

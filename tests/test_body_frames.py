@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import refused, with_masts
 
 import coopoc as co
 from coopoc.world.body_frames import body_motion, in_world, true_heading
@@ -55,15 +55,10 @@ def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(
 
 
 def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing):
-    still = co.Fleet(
-        (*crossing.ids, "mast"),
-        crossing.t,
-        np.append(crossing.position, np.full((60, 1, 3), 5.0), axis=1),
-        np.append(crossing.velocity, np.zeros((60, 1, 3)), axis=1),
-    )
     v2x = co.V2X(max_neighbours=2, radius=40.0)
     alone, seen = (
-        co.observe(one, co.Sensors(), v2x, landmarks=marks) for one, marks in ((crossing, ()), (still, ["mast"]))
+        co.observe(one, co.Sensors(), v2x, landmarks=marks)
+        for one, marks in ((crossing, ()), (with_masts(crossing, [[5.0] * 3]), ["m0"]))
     )
     assert (seen.gnss[:, :, 8] == 5.0).all()
     of_mast = seen.links.neighbour == 8

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import textbook, winding
+from conftest import holed, slow_fixes, textbook, winding
 from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
-from test_star_filters import CHANNELS, gappy, holed, partial, slow_fixes
+from test_star_filters import CHANNELS, gappy, partial
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Method, Recording, Sensors, load_fleet, nees, observe, rt_le
+from coopoc import V2X, Fleet, JointFilter, Kalman, Method, Recording, Sensors, Track, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import errors
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
@@ -51,6 +51,16 @@ def test_with_everything_off_it_is_the_joint_filter(change):
     ours, joint = CooperativeFilter(priors=AS_STATED)(seen, [0, 3]), textbook(JointFilter())(seen, [0, 3])
     assert_allclose(ours.x, joint.x, atol=2e-5)
     assert_allclose(ours.covariance[:, 1:], joint.covariance[:, 1:], rtol=2e-3, atol=1e-8)
+
+
+def assert_is_the_oracle(track: Track, seen: Recording, priors: Priors = Priors()):
+    """Of ego 0, in every run."""
+    for run in range(seen.runs):
+        x, cov, others = Oracle(seen, 0, run, resolve("nominal", seen), priors).loop()
+        assert_allclose(track.x[run, :, 0], x, atol=1e-6)
+        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
+        if len(track.neighbours[run]):
+            assert_allclose(track.neighbours[run][-len(np.concatenate(others)) :], np.concatenate(others), atol=2e-6)
 
 
 def mean_errors(seen: Recording, fleet: Fleet, egos: Sequence[int], *others: Method) -> list[float]:
@@ -271,9 +281,7 @@ def test_a_position_of_a_minute_is_kept():
     seen = observe(fleet, replace(S2, gnss_std=(0.5,) * 3), V2X(0), runs=1, seed=3)
     jumped = moved(seen, slice(64, None), 0, [60.0, 45.0, 0.0])
     track = CooperativeFilter()(jumped)
-    x, cov, _ = Oracle(jumped, 0, 0, resolve("nominal", jumped), Priors()).loop()
-    assert_allclose(track.x[0, :, 0], x, atol=1e-6)
-    assert_allclose(track.covariance[0, :, 0], cov, rtol=1e-6, atol=1e-6)
+    assert_is_the_oracle(track, jumped)
     assert errors(track, fleet)[:, 64:].max() < 15.0
     assert errors(Kalman()(jumped), fleet)[0, -1, 0] > 30.0
 
@@ -288,8 +296,7 @@ def test_a_fix_counts_as_wrong_where_slipping_cannot_explain_it(vehicles):
     track = CooperativeFilter()(jumped)
     assert rt_le(track, fleet).max() < 0.03
     if vehicles == 1:
-        x, _, _ = Oracle(jumped, 0, 0, resolve("nominal", jumped), Priors()).loop()
-        assert_allclose(track.x[0, :, 0], x, atol=1e-6)
+        assert_is_the_oracle(track, jumped)
 
 
 def test_neighbours_that_send_nothing_judge_no_receiver():
@@ -372,15 +379,9 @@ def test_the_filter_is_its_oracle(crossing, case, priors):
     sensors, v2x, change = BAD[case]
     fleet = gappy(crossing)
     seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
-    track, known = CooperativeFilter(priors=priors)(seen), resolve("nominal", seen)
-    assumed = ON_ROADS if seen.measured and priors == Priors() else priors
+    track = CooperativeFilter(priors=priors)(seen)
     assert (track.extras["alone"] > 0).any() == (case == "mirrored" and priors == Priors())
-    for run in range(2):
-        x, cov, others = Oracle(seen, 0, run, known, assumed).loop()
-        assert_allclose(track.x[run, :, 0], x, atol=1e-6)
-        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
-        if len(track.neighbours[run]):
-            assert_allclose(track.neighbours[run][-len(np.concatenate(others)) :], np.concatenate(others), atol=2e-6)
+    assert_is_the_oracle(track, seen, ON_ROADS if seen.measured and priors == Priors() else priors)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from conftest import refused, without
+from conftest import refused, slow_fixes, without
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
@@ -38,8 +38,7 @@ def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> 
     position = np.cumsum(rng.normal(0, 0.2, (steps, vehicles, 3)), axis=0)
     fleet = Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, np.full((steps, vehicles, 3), 1e-9))
     recording = observe(fleet, Sensors(gnss_std=(1.5, 1.5, 1.5)), V2X(max_neighbours=0))
-    fixes = np.where((np.arange(steps) % every == 0)[:, None, None], recording.gnss, np.nan)
-    return replace(recording, gnss=fixes), fleet
+    return slow_fixes(recording, every), fleet
 
 
 def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:

@@ -9,6 +9,7 @@ from conftest import holed, refused
 from numpy.testing import assert_allclose
 from oracles.pace import after
 from oracles.solo import filterpys
+from test_learned_measured import walk
 
 from coopoc import Fleet, Sensors, observe
 from coopoc.evaluate.metrics import nees
@@ -20,18 +21,10 @@ from coopoc.learned.training.fit import Judge
 from coopoc.learned.training.okf_fit import fit_okf
 
 
-def walk(steps: int, seed: int = 0) -> Fleet:
-    """Standing velocity readings of a vehicle that moves by N(0, 0.2^2) m per step and axis: velocity noise is the
-    process noise, known exactly."""
-    rng = np.random.default_rng(seed)
-    position = np.cumsum(rng.normal(0, 0.2, (steps, 1, 3)), axis=0)
-    return Fleet(("w",), np.arange(steps) / 10, position, np.zeros((steps, 1, 3)))
-
-
 @pytest.mark.parametrize("start", ["gnss", "true"])
 def test_recovers_the_noise_of_a_linear_problem(start):
     """Known: 0.2 m per step and 1.5 m; the loss fixes the ratio, the innovations fix the scale."""
-    (client,) = clients(walk(8100), Sensors(), piece=100, start=start)  # type: ignore[arg-type]
+    (client,) = clients(walk(8100, 1)[1], Sensors(), piece=100, start=start)  # type: ignore[arg-type]
     model, card = fit_okf(client.training, client.validation, steps=120)
     method = model.method("okf")
     assert_allclose(method.process_std, 0.2, rtol=0.12)
@@ -82,16 +75,16 @@ def test_equals_filterpy():
 @pytest.mark.slow
 def test_trained_covariance_is_calibrated():
     """Mean NEES of a three-state filter with the right covariance is 3."""
-    (client,) = clients(walk(8100), Sensors())
+    (client,) = clients(walk(8100, 1)[1], Sensors())
     method = fit_okf(client.training, client.validation, steps=120)[0].method("okf")
-    fleet = walk(400, seed=9)
+    fleet = walk(400, 1, seed=9)[1]
     claimed = nees(method(observe(fleet, Sensors(), runs=30)), fleet)
     assert claimed[:, 50:].mean() == pytest.approx(3.0, rel=0.15)
 
 
 def test_padding_does_not_weigh():
     """A short set of pieces keeps its own mean when it is stacked with a long one."""
-    (client,) = clients(walk(900), Sensors(), piece=20)
+    (client,) = clients(walk(900, 1)[1], Sensors(), piece=20)
     few, many = client.training.take(range(3)), client.training
     net = NoiseParameters()
     alone = [float(Judge([[part]], net)(flatten([net]))) for part in (few, many)]

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import slow_fixes
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 
@@ -37,8 +38,7 @@ def drive(every: int, std: float, most: int = 0, act: float = 1.0) -> tuple[Reco
     stated = replace(S2, gnss_std=(std,) * 3)
     acting = replace(stated, gnss_std=(act * std,) * 3)
     seen = observe(town, acting, V2X(most), runs=2, observers=EGOS, assumed=stated)
-    thinned = np.where(np.arange(STEPS)[:, None, None] % every, np.nan, seen.gnss)
-    return replace(seen, gnss=thinned), town.position[:, EGOS]
+    return slow_fixes(seen, every), town.position[:, EGOS]
 
 
 @pytest.mark.parametrize("begins", [0, BEGINS])
@@ -93,10 +93,9 @@ def test_odometry_that_errs_a_little(fault, every, beside):
     fleet = co.Fleet(("a", "b"), t, velocity.cumsum(axis=0) + np.array([[0.0] * 3, [0.0, 40.0, 0.0]]), velocity)
     std, floor, ranges = (30.0 if fault == "noisy" else 3.0, 0.05, 5.0) if ships else (0.5, 0.05, 0.1)
     sensors = co.Sensors(gnss_std=(std,) * 3, velocity_std_ratio=0.0, velocity_floor=floor, range_std=ranges)
-    seen = observe(fleet, sensors, V2X(beside, radius=100.0), runs=4)
-    gnss = np.where(t[:, None, None] % every, np.nan, seen.gnss)
+    seen = slow_fixes(observe(fleet, sensors, V2X(beside, radius=100.0), runs=4), every)
     relative = np.where([True, False, False], seen.relative, np.nan)
-    log = replace(seen, gnss=gnss, velocity=seen.velocity + wrong, relative=relative, notes=(NOTHING_SIMULATED,))
+    log = replace(seen, velocity=seen.velocity + wrong, relative=relative, notes=(NOTHING_SIMULATED,))
     kalman, joint, mine = (
         np.sqrt(np.square(m(log, (0, 1)).x - fleet.position)[:, 900:, :, :2].sum(axis=-1).mean())
         for m in (Kalman(), JointFilter(), CooperativeFilter())

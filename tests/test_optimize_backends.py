@@ -9,6 +9,7 @@ from conftest import refused
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import star
 from scipy.optimize import least_squares
+from test_optimize_constraints import chain
 
 from coopoc import V2X, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Backend, Problem, SolverResult, Status, backends, solve
@@ -79,21 +80,11 @@ def test_marginals_are_those_of_gtsams_bayes_tree(crossing_recording, length, ba
     assert solution.covariance == pytest.approx(theirs, abs=1e-6)
 
 
-def chain_of(points: int) -> Problem:
-    """A random walk with some fixes: a linear problem."""
-    rng = np.random.default_rng(points)
-    problem = Problem(tuple(f"p{i}" for i in range(points)))
-    pairs = np.c_[np.arange(points - 1), np.arange(1, points)]
-    problem = problem.add("displacement", pairs, rng.normal(size=(points - 1, 3)), std=0.1)
-    seen = sorted(rng.choice(points, points // 4, replace=False).tolist())
-    return problem.add("position", seen, rng.normal(size=(len(seen), 3)) * 5, std=rng.uniform(1, 3, (len(seen), 3)))
-
-
 @pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("points", [5, 40, 300])
 def test_a_linear_problem_equals_lstsq(points, backend):
     """Dense, sparse (300 points) and osqp's and gtsam's own elimination, against NumPy's lstsq."""
-    problem = chain_of(points)
+    problem = chain(points, points)
     r, J = problem.whiten(np.zeros((points, 3)))
     x = np.linalg.lstsq(J.toarray(), -r)[0].reshape(-1, 3)
     solution = solve(problem, backend)

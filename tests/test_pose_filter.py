@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused, textbook, without
+from conftest import refused, textbook, with_masts, without
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import pose_filter as oracle
 from oracles.pace import heard
@@ -42,18 +42,12 @@ def with_gaps(recording: co.Recording, seed: int = 0) -> co.Recording:
     return replace(recording, gnss=gnss, relative=relative, body=co.Body(body.yaw_rate, heading))
 
 
-def with_masts(fleet: co.Fleet) -> co.Fleet:
-    """Two landmarks more."""
-    masts = np.broadcast_to([[5.0, 5.0, 3.0], [-10.0, 4.0, 2.0]], (len(fleet.t), 2, 3))
-    position, velocity = (np.append(a, b, axis=1) for a, b in ((fleet.position, masts), (fleet.velocity, 0 * masts)))
-    return co.Fleet((*fleet.ids, "mast", "tower"), fleet.t, position, velocity)
-
-
 @pytest.fixture(scope="module")
 def rough(crossing):
     """Vehicle 1 is away for a while, vehicle 2 comes late."""
-    fleet, marks = with_masts(without(crossing, (slice(25, 30), 1), (slice(10), 2))), ["mast", "tower"]
-    return with_gaps(co.observe(fleet, NOISE, LATE, runs=2, seed=4, frame="body", landmarks=marks))
+    moving, masts = without(crossing, (slice(25, 30), 1), (slice(10), 2)), [[5, 5, 3], [-10, 4, 2]]
+    fleet = with_masts(moving, masts)
+    return with_gaps(co.observe(fleet, NOISE, LATE, runs=2, seed=4, frame="body", landmarks=["m0", "m1"]))
 
 
 @pytest.mark.parametrize(

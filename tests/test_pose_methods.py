@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import refused
+from conftest import refused, with_masts
 from logs import noisy
 
 import coopoc as co
@@ -25,10 +25,8 @@ def convoy(vehicles: int = 5, steps: int = 200, masts: int = 0) -> co.Fleet:
     velocity = 10 * np.stack([np.cos(course), np.sin(course), 0 * course], axis=2)
     start = np.c_[8.0 * np.arange(vehicles), 3.0 * (np.arange(vehicles) % 2), 0.0 * np.arange(vehicles)]
     position = start + np.cumsum(0.1 * velocity, axis=0)
-    stands = np.c_[60.0 * np.arange(masts), 12.0 + 0 * np.arange(masts), 4.0 + 0 * np.arange(masts)]
-    places = np.broadcast_to(stands, (steps, masts, 3))
-    ids = tuple([f"v{k}" for k in range(vehicles)] + [f"m{k}" for k in range(masts)])
-    return co.Fleet(ids, t, np.append(position, places, axis=1), np.append(velocity, 0 * places, axis=1))
+    fleet = co.Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, velocity)
+    return with_masts(fleet, np.arange(masts)[:, None] * [60.0, 0.0, 0.0] + [0.0, 12.0, 4.0])
 
 
 def observed(fleet: co.Fleet, sensors: co.Sensors = WHITE, runs: int = 30, **more: Any) -> co.Recording:

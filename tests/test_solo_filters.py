@@ -1,10 +1,8 @@
 """Solo filters against textbook oracles, with gaps and absences; noise of fixes that need not be known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from conftest import refused, winding
+from conftest import holed, refused, winding, without
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import solo as oracle
 
@@ -31,22 +29,14 @@ def test_noise_of_fixes_need_not_be_known(std):
 def test_bad_settings_are_named(crossing):
     for shape in ((2, 3), (9, 1, 3)):
         with refused("^x0 = "):
-            Kalman(x0=np.zeros(shape))(gaps(crossing, absent=False))
+            Kalman(x0=np.zeros(shape))(gaps(crossing))
     with refused("^velocity_floor = "):
-        Kalman(NoiseModel.nominal(Sensors(velocity_floor=0.0)))(gaps(crossing, absent=False))
+        Kalman(NoiseModel.nominal(Sensors(velocity_floor=0.0)))(gaps(crossing))
 
 
-def gaps(fleet: Fleet, absent: bool, runs: int = 3) -> Recording:
-    """Some fixes missing everywhere, and one vehicle that is away for a while."""
-    position, velocity = fleet.position.copy(), fleet.velocity.copy()
-    if absent:
-        position[20:30, 1], velocity[20:30, 1] = np.nan, np.nan
-    recording = observe(replace(fleet, position=position, velocity=velocity), S2, V2X(max_neighbours=0), runs=runs)
-    gnss, gone = recording.gnss.copy(), np.random.default_rng(2).uniform(size=recording.gnss.shape[:3]) < 0.4
-    gone[:, 0] = False
-    gone[:, 30] = False
-    gnss[gone] = np.nan
-    return replace(recording, gnss=gnss)
+def gaps(fleet: Fleet, *away: tuple[slice, int]) -> Recording:
+    """Some fixes missing everywhere, and vehicles that are away for a while."""
+    return holed(observe(without(fleet, *away), S2, V2X(max_neighbours=0), runs=3), 0.4)
 
 
 def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | float, ...]:
@@ -58,7 +48,7 @@ def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | fl
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("noise", ["nominal", "identity"])
 def test_kalman(crossing, noise, known):
-    seen = gaps(crossing, absent=True)
+    seen = gaps(crossing, (slice(20, 30), 1))
     model = NoiseModel.identity() if noise == "identity" else NoiseModel.nominal(S2)
     q, r = np.broadcast_to(model.process_variance(seen, first=int(known)), seen.gnss.shape), model.gnss_variance
     start = crossing.position[0] if known else None
@@ -70,7 +60,7 @@ def test_kalman(crossing, noise, known):
 
 
 def test_gnss_holds_the_last_fix(crossing):
-    seen = gaps(crossing, absent=False)
+    seen = gaps(crossing)
     track = GNSS()(seen, [1, 3])
     assert 0 < track.seconds < 60
     for t in range(len(seen.t)):
