@@ -258,6 +258,29 @@ def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
     assert errors(track, fleet)[:, 500 // step :].mean() < 1.8
 
 
+@pytest.mark.parametrize("ego", [0, 12, 36])
+def test_a_fix_that_a_receiver_repeats_is_left_as_soon_as_it_ends(ego):
+    """Law: for 6 s it passes for wheels that spin, alone; then the ego is where odometry led. It stayed 22 m off."""
+    fleet = load_fleet("town10").between(0, 400)
+    seen = observe(fleet, replace(S2, gnss_std=(1.5,) * 3), V2X(0), runs=4, seed=3, observers=[ego])
+    gnss = seen.gnss.copy()
+    gnss[:, 150:210, ego] = gnss[:, 149:150, ego]
+    assert errors(CooperativeFilter()(replace(seen, gnss=gnss), [ego]), fleet)[:, 230:].mean() < 0.6
+
+
+@pytest.mark.parametrize("seed", [6000043, 6000066, 6000083])
+def test_receivers_that_all_jump_alike_are_not_followed_for_seconds(seed):
+    """Law: the star agrees on a position that all receivers leave together for 3 s, and is left when it has been
+    contradicted for as long as it held: neighbours, which see the ego at its fix, cost 5 to 8 times a Kalman filter."""
+    drawn = world(seed, "validation")
+    wrong, dt = drawn.recording, drawn.recording.dt
+    for second in (10, 24, 36):
+        steps = slice(int(second / dt), int((second + 3) / dt))
+        wrong = moved(wrong, steps, slice(None), [20.0, -10.0, 0.0])
+    ours, alone = mean_errors(wrong, drawn.fleet, drawn.egos, Kalman())
+    assert ours < 1.5 * alone
+
+
 @pytest.mark.parametrize("ego", [12, 24])
 @pytest.mark.parametrize("reverse", [False, True])
 def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):

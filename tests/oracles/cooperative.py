@@ -383,6 +383,8 @@ class Oracle:
             return
         first, self.state = self.state, before
         rate, shows = (share * self.state.speed) ** 2, self.r[t, self.ego] @ self.white + self.state.shown**2
+        if not before.left:
+            self.keep_place(shows)
         self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
         self.step(t, rate * dt**2 + (min(rate * SLIP_HIDDEN_S**2, shows) if p <= 0.5 and dt < SLIP_HIDDEN_S else 0.0))
         self.corrected_now = False
@@ -470,6 +472,7 @@ class Oracle:
     def step(self, t, slip: float):
         s, g, b = self.state, self.priors, self.state.belief
         s.score = s.numbers = s.squares = s.share = 0.0
+        s.now = slip > 0
         self.gather(t)
         others, messages, relative = [*self.messages], self.messages, self.relative
         louder = self.louder(self.ego)
@@ -485,10 +488,11 @@ class Oracle:
             if j not in others or again or self.contradicted(t, j):
                 self.dismiss(j, j in others, outvoted)
         dt = self.dt
-        if s.hits.get(self.ego, 0) == 0:
+        trusted = self.ego in s.trusted
+        if trusted and s.hits.get(self.ego, 0) == 0:
             s.agreed += dt
-        elif s.agreed < ESTABLISHED:
-            s.agreed = max(s.agreed - 1.5 * dt, 0.0)
+        elif s.agreed < ESTABLISHED or not trusted:
+            s.agreed = max(min(s.agreed, ESTABLISHED) - 1.5 * dt, 0.0)
         s.unseen += dt
         u, q = self.motion(t)
         u, q = self.steady(t, self.ego, u, louder * q)
@@ -568,16 +572,21 @@ class Oracle:
         s.share = self.use_fix(t, self.ego, rows, True, slip)
         self.corrected()
 
+    def keep_place(self, more: float):
+        s, b, at = self.state, self.state.belief, self.state.belief.at("x", self.ego)
+        s.left = b.x[at].copy(), (np.trace(b.p[at, at]) + more) / 3
+        s.evidence = s.agree = s.driven = 0.0
+
     def go_back(self, t, fix: Floats, rows: list[Any]):
         """To where the ego was before fixes contradicted it, if it is there again."""
         s, b = self.state, self.state.belief
         q, gap, cov, r = self.mahalanobis(b, rows)
         gate, at = max(self.priors.fix_gate, FIX_GATE), b.at("x", self.ego)
-        s.agree = 0.0 if q > gate else s.agree + float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
+        gain = 0.0 if s.now else float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
+        s.agree = 0.0 if q > gate else s.agree + gain
         if not s.left:
             if q > gate:
-                s.left, s.evidence = (b.x[at].copy(), np.trace(b.p[at, at]) / 3), 0.0
-                s.driven = 0.0
+                self.keep_place(0.0)
             return
         (x, p), most = s.left, HARD_REJECT_FACTOR * gate
         if ("o", self.ego) in b.names and self.life.absent[0] == -inf:
@@ -644,6 +653,7 @@ class Oracle:
             self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
+                s.agreed = s.agreed if s.jumped else 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0 if supported else 1.0
@@ -840,6 +850,8 @@ class Oracle:
             return False
         if self.ego in s.trusted:
             return bool(s.hits[self.ego] > 0 and s.locked.get(self.ego, 0.0) >= PATIENCE)
+        if s.agreed > 0:
+            return False
         b, noise = s.belief, (self.r[t, self.ego] @ self.white) / 3
         error = b.x[b.at("b", self.ego)]
         apart = [float(np.square(error - b.x[b.at("b", j)]).sum()) for j in held]

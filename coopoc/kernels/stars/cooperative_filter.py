@@ -132,6 +132,7 @@ from .otherwise import (
     corrected_motion,
     ego_variance,
     gap_to_fix,
+    hidden,
     learn_fix,
     learn_relative,
     measured_motion,
@@ -270,6 +271,8 @@ def step(
     fails = tries.doubts[PENDING] > 0.0
     if slips and surprised(f, fails or failure_known):
         other.ego[NOW] = 1.0
+        if other.ego[LEFT + 3] >= NOT_REMEMBERED_M2:
+            remember_place(other, hidden(other, tries.own))
         if fails or failure_known:
             corrected_motion(other, tries.own, tries.own[MORE] if failure_known else tries.doubts[PENDING])
         attempt(other, model, tries.own, tries.rows, vehicles, count)
@@ -331,10 +334,13 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     scale_motion_noise(f, own, rows, vehicles, count)
     f.ego[SPAN] = own[DT]
     f.ego[SINCE_FIX] += own[DT]
-    if f.who[0, REJECTED] == 0:
+    trusted = f.status[f.who[0, VEHICLE], TRUSTED] > 0.0
+    if f.who[0, REJECTED] == 0 and trusted:
         f.ego[AGREED] += own[DT]
-    elif f.ego[AGREED] < ESTABLISHED:  # faster, so that a start of 10 s that was wrong is left 10 s later
-        f.ego[AGREED] = max(f.ego[AGREED] - 1.5 * own[DT], 0.0)
+    elif (
+        f.ego[AGREED] < ESTABLISHED or not trusted
+    ):  # faster, so that a start of 10 s that was wrong is left 10 s later
+        f.ego[AGREED] = max(min(f.ego[AGREED], ESTABLISHED) - 1.5 * own[DT], 0.0)
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]
     replace_implausible_velocity(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
@@ -417,6 +423,15 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
     corrected(f)
 
 
+@part
+def remember_place(f: Filter, more: float) -> None:
+    """Remember where the ego is, before fixes lead it away; they may have done so already, with that variance m^2."""
+    for c in range(3):
+        f.ego[LEFT + c] = f.g.x[c]
+    f.ego[LEFT + 3] = (ego_variance(f) + more) / 3.0
+    f.ego[LEFT + 4] = f.ego[LEFT + 5] = f.ego[LEFT + 6] = 0.0
+
+
 @inside
 def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q: float) -> bool:
     """Whether an ego is where it was before fixes contradicted it (`gate.remember`), and no neighbours say otherwise:
@@ -429,14 +444,12 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
     for c in range(3):
         p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
         other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP_M2)
-        gain += p / (3.0 * (p + r))
+        gain += p / (3.0 * (p + r)) if f.ego[NOW] == 0.0 else 0.0
         apart += (g.x[c] - left[c] + p / (p + r) * h.three[GAP + c]) ** 2  # where this fix would put it
     gate = max(model.fix_gate, FIX_GATE)
     what, left[4], left[5] = remember(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])
     if what == BEGIN:
-        for c in range(3):
-            left[c] = g.x[c]
-        left[3], left[6] = ego_variance(f) / 3.0, 0.0
+        remember_place(f, 0.0)
         return False
     if what == BACK and speak_for(f, model, own, rows, count, vector_at(g.x, 0), vector_at(left, 0)) > 0.0:
         return False

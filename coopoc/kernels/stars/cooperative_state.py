@@ -343,6 +343,8 @@ def needs_restart(f: Filter, own: Floats) -> bool:
         return False
     if f.status[f.who[0, VEHICLE], TRUSTED] > 0.0:
         return bool(f.who[0, REJECTED] > 0 and f.member[0, LOCKED] >= PATIENCE)
+    if f.ego[AGREED] > 0.0:
+        return False
     for k in range(1, len(f.who)):
         last = k if f.who[k, VEHICLE] >= 0 and f.status[f.who[k, VEHICLE], USED] > -math.inf else last
     error, noise = vector_at(f.g.x, f.g.block[0, ERROR]), sum(vector_at(own, FIX_VARIANCE // 3)) / 3.0

@@ -378,6 +378,12 @@ def show(f: Filter) -> None:
 
 
 @part
+def hidden(f: Filter, own: Floats) -> float:
+    """m^2, by how much fixes show at most that the ego has slipped unnoticed."""
+    return float(sum(vector_at(own, FIX_VARIANCE // 3)) + f.ego[SHOWN] ** 2)
+
+
+@part
 def slip(f: Filter, model: Model, own: Floats) -> None:
     """Add variance along the ego's way if this try assumes that it slips. A slip that begins now may have lasted for
     SLIP_HIDDEN_S already, but not farther than fixes err and have shown; where fixes correct the motion, not farther
@@ -387,7 +393,7 @@ def slip(f: Filter, model: Model, own: Floats) -> None:
     rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
     variance = rate * own[DT] ** 2
     if f.ego[SLIPPED] <= 0.5 and own[DT] < SLIP_HIDDEN_S:
-        variance += min(rate * SLIP_HIDDEN_S**2, sum(vector_at(own, FIX_VARIANCE // 3)) + f.ego[SHOWN] ** 2)
+        variance += min(rate * SLIP_HIDDEN_S**2, hidden(f, own))
     if f.ego[CORRECTED] > 0.0:
         variance = min(variance, LEFT_OPEN * f.ego[CORRECTED])
     widen(f.g, 0, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
