@@ -4,10 +4,10 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -22,9 +22,6 @@ from .results import SEED, Results, ego_by_run
 from .study import Params, find_study
 from .style import label, words
 from .tables import Entry, Table
-
-Direction: TypeAlias = str | float
-"""Of a metric: "lower" or "higher" is better, or the value that is best."""
 
 PAIRED_TOLERANCE, TRAINED_TOLERANCE = 0.01, 0.05
 """Share of a number by which it may move: draws are paired, but libraries differ in their last digits, and nets are
@@ -47,7 +44,6 @@ NUMBER_READERS: Mapping[str, Any] = {
     "runs": lambda runs: max(int(runs), 1),
     "run_std": _finite,
     "tolerance": _finite,
-    "better": lambda better: better if better in ("lower", "higher") else _finite(better),
 }
 """Field of a number -> how it is read."""
 FREE_SETTINGS = ("runs", "weights", "backend", "metric")
@@ -65,7 +61,6 @@ class Number:
         runs: number of runs.
         run_std: standard deviation of a run's mean.
         tolerance: share of the value by which it may move.
-        better: direction of the metric.
     """
 
     where: Params
@@ -74,7 +69,6 @@ class Number:
     runs: int
     run_std: float
     tolerance: float
-    better: Direction
 
     @property
     def key(self) -> tuple[str, str]:
@@ -90,26 +84,27 @@ class Change:
         was: the reference.
         now: its value now.
         difference: now less the reference, with what its tolerance and the noise of other runs allow.
+        better: "lower" or "higher" if that is better, or the value that is best.
     """
 
     was: Number
     now: float
     difference: Interval
+    better: str | float
 
     @property
     def verdict(self) -> str:
         """within noise, better or worse.
 
-        >>> was = Number({}, "rt_le_m", 1.0, 3, 0.0, 0.01, "lower")
-        >>> Change(was, 1.2, Interval(0.2, 0.19, 0.21, 3)).verdict
+        >>> was = Number({}, "rt_le_m", 1.0, 3, 0.0, 0.01)
+        >>> Change(was, 1.2, Interval(0.2, 0.19, 0.21, 3), "lower").verdict
         'worse'
         """
         if self.difference.low <= 0 <= self.difference.high:
             return "within noise"
-        better = self.was.better
-        if isinstance(better, str):
-            return "better" if (self.difference.mean > 0) == (better == "higher") else "worse"
-        return "better" if abs(self.now - better) < abs(self.was.value - better) else "worse"
+        if isinstance(self.better, str):
+            return "better" if (self.difference.mean > 0) == (self.better == "higher") else "worse"
+        return "better" if abs(self.now - self.better) < abs(self.was.value - self.better) else "worse"
 
 
 @dataclass(frozen=True)
@@ -142,34 +137,34 @@ class Reference:
         return cls(document["study"], document["settings"], numbers)
 
 
-def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
-    """The means of the metrics at every point of the grid that has finished.
-
-    Args:
-        results: of the study.
-        metrics: name -> "lower", "higher" or the value that is best.
-    """
+def measure(results: Results, metrics: Iterable[str]) -> Reference:
+    """The means of the metrics at every point of the grid that has finished."""
     numbers = []
     for point, rows in results.groups(results.axes) if len(results.frame) else ():
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
         tolerance = TRAINED_TOLERANCE if SEED in rows and rows[SEED].notna().any() else PAIRED_TOLERANCE
-        for metric, better in metrics.items():
+        for metric in metrics:
             each = ego_by_run(rows, metric)[0] if metric in rows else np.empty(0)
             if each.size:
                 runs = each.shape[1]
                 std = each.mean(axis=0).std(ddof=1) if runs > 1 else 0.0
                 mean, std = (float(f"{value:.6g}") for value in (each.mean(), std))  # more depends on the machine
-                numbers.append(Number(where, metric, mean, runs, std, tolerance, better))
+                numbers.append(Number(where, metric, mean, runs, std, tolerance))
     return Reference(results.study, {k: plain(v) for k, v in results.settings.items()}, tuple(numbers))
 
 
-def check(results: Results, reference: Reference) -> list[Change]:
+def check(results: Results, reference: Reference, metrics: Mapping[str, str | float]) -> list[Change]:
     """Changes of the results (B) from the reference (A), of the numbers that both have.
+
+    Args:
+        results: of the study.
+        reference: its committed numbers.
+        metrics: name -> what is `better`.
 
     Raises:
         InputError: their settings differ, so that the numbers mean different things.
     """
-    measured = measure(results, {number.metric: number.better for number in reference.numbers})
+    measured = measure(results, metrics)
     a, b = reference.settings, measured.settings
     if others := sorted(name for name in {*a, *b} - {*FREE_SETTINGS} if a.get(name) != b.get(name)):
         differs = f"is not the reference's in {', '.join(others)}"
@@ -180,7 +175,8 @@ def check(results: Results, reference: Reference) -> list[Change]:
         if was := before.get(now.key):
             noise = 0.0 if was.runs == now.runs else SIGMA * was.run_std * np.sqrt(1 / was.runs + 1 / now.runs)
             moved, allowed = now.value - was.value, float(was.tolerance * abs(was.value) + noise)
-            changes.append(Change(was, now.value, Interval(moved, moved - allowed, moved + allowed, now.runs)))
+            difference = Interval(moved, moved - allowed, moved + allowed, now.runs)
+            changes.append(Change(was, now.value, difference, metrics[now.metric]))
     return changes
 
 
@@ -241,7 +237,7 @@ def reference(
         made.save(file)
         print(f"coopoc: {len(made.numbers)} numbers are in {file}", file=sys.stderr)
         return 0
-    changes = check(results, Reference.load(file))
+    changes = check(results, Reference.load(file), of.metrics)
     shown = table(changes, everything=all)
     print(shown.to_markdown() if shown.rows else shown.caption)
     return int(any(change.verdict == "worse" for change in changes))

@@ -130,7 +130,6 @@ REFERENCE = json.dumps(
                 "runs": 4,
                 "run_std": 0.1,
                 "tolerance": 0.01,
-                "better": "lower",
             }
         ],
     },
