@@ -111,7 +111,7 @@ def read_bag(
             of = _vehicles(what, truth, path.stem)
             for c in reader.connections:
                 if not topics[c.topic]:
-                    summary.leave(f"{path.name}: topic {c.topic} ({c.msgtype})", c.msgcount)
+                    summary.unused[f"{path.name}: topic {c.topic} ({c.msgtype})"] += c.msgcount
                 elif what[c.topic] == "odometry" and of[c.topic][1]:
                     fields[c.topic] = [f"pose.{field}" for field in POSE.split()]
             for number, (c, received, raw) in enumerate(reader.messages(connections=wanted) if wanted else (), 1):

@@ -49,7 +49,7 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
     parts = list[pd.DataFrame]()
     for tag, lines in every.items():
         if tag not in FORMS:
-            summary.leave(f"{path.name}: lines {tag}", len(lines))
+            summary.unused[f"{path.name}: lines {tag}"] += len(lines)
             continue
         names = FORMS[tag].split()
         cut = [words[: len(names)] for words in lines.values()]

@@ -56,7 +56,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             where += f", {next(iter(str(error).splitlines()), '')[:60].partition(' - ')[0]}"
             reason = "damaged NMEA sentences"
         if reason.startswith("NMEA"):
-            summary.leave(reason, 1)
+            summary.unused[reason] += 1
         elif reason:
             summary.refuse(reason, 1, where)
     frame = pd.DataFrame.from_dict(sentences.rows, orient="index")

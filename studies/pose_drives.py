@@ -58,7 +58,7 @@ class Drive:
     @property
     def ids(self) -> tuple[str, ...]:
         """Of those that move."""
-        return tuple(name for k, name in enumerate(self.recording.ids) if k not in self.recording.landmarks)
+        return tuple(self.recording.ids[k] for k in self.recording.vehicles)
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,9 +209,8 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in assumed.items() if name in own})  # type: ignore[type-var]
-    ids = [name for k, name in enumerate(recording.ids) if k not in recording.landmarks]
-    made(recording.between(0, 3), ids)  # compiles
-    track = made(recording, ids)
+    made(recording.between(0, 3), recording.vehicles)  # compiles
+    track = made(recording, recording.vehicles)
     blocks = partial(blocks_of, start=start, length=block_s / fleet.dt)
     row: Row = {"task": task, "data": hashed(path), "rt_le_m": rounded(blocks(errors(track, fleet)[0]).T)}
     if fleet.heading is None:

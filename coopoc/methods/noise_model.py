@@ -3,10 +3,11 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints, check_fields, checked, instance, number, refuse, remade, texts
+from ..arrays import TINY, Floats, Ints, check_fields, checked, instance, number, refuse, remade, texts
 from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..plugins import find
@@ -68,12 +69,9 @@ class NoiseModel:
             "Convert degrees by np.deg2rad.",
         )
         self.__dict__["compass"] = tuple(compass.tolist())
-        for field in ("process_std", "gnss_std"):
-            if field == "gnss_std" or self.process_std is not None:
-                value = checked(field, getattr(self, field), "(3,)", (3,))
-                wrong = ~(np.isfinite(value) & (value > 0))
-                refuse(field, value, wrong, "must be positive and finite", "Give standard deviations above zero.")
-                self.__dict__[field] = tuple(value.tolist())
+        if self.process_std is not None:
+            check_std(self, "process_std")
+        check_std(self, "gnss_std")
 
     @classmethod
     def identity(cls) -> "NoiseModel":
@@ -330,6 +328,15 @@ def _resolvable(noise_model: NoiseModel) -> NoiseModel:
     beside = f"finer ones beside a fix of {max(noise_model.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
     return replace(noise_model, sensors=replace(noise_model.sensors, **raised), notes=(*noise_model.notes, note))
+
+
+def check_std(made: Any, field: str, least: float = TINY) -> None:
+    """A tuple of three standard deviations in a field of a dataclass; InputError unless they are finite and at least
+    that."""
+    value = checked(field, getattr(made, field), "(3,)", (3,))
+    wrong, allowed = ~((value >= least) & (value < np.inf)), f"must be {'positive' if least else '>= 0'} and finite"
+    refuse(field, value, wrong, allowed, "Give standard deviations of three axes.")
+    made.__dict__[field] = tuple(value.tolist())
 
 
 def constant_noise(noise_model: NoiseModel | str) -> NoiseModel:

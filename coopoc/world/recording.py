@@ -179,6 +179,11 @@ class Recording:
         return np.broadcast_to(more, self.gnss.shape[1:3])[..., None]
 
     @property
+    def vehicles(self) -> list[int]:
+        """Columns of the members that are no landmarks."""
+        return [k for k in range(len(self.ids)) if k not in self.landmarks]
+
+    @property
     def measured(self) -> bool:
         """Whether the notes say that nothing is simulated."""
         return any(NOTHING_SIMULATED in note for note in self.notes)

@@ -399,7 +399,7 @@ def against_truth(c: Check) -> Check:
         return c
     marks = np.isin(np.arange(len(rec.ids)), rec.landmarks)
     off, (_, _, velocity), _ = causes(c)
-    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
+    fits = np.less([_beside(*one) for one in zip(off.T, velocity.T, strict=True)], 3 * c.fix_noise)
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
     if c.log.recording.body is None:

@@ -120,7 +120,7 @@ def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Row
 
 def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:
     """(M,) columns of names, -1 where they are no member."""
-    return pd.Index(list(ids)).get_indexer(pd.Index(names)).astype(np.int64)
+    return pd.Index(list(ids)).get_indexer(pd.Index(names))
 
 
 def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:

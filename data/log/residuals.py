@@ -91,9 +91,9 @@ def together(log: Log) -> tuple[Log, str]:
         InputError: the vehicles share no two steps.
     """
     rec = log.recording
-    there: Bools = np.isfinite(rec.velocity[0][:, _moving(rec), 0]).all(axis=1)
+    there: Bools = np.isfinite(rec.velocity[0][:, rec.vehicles, 0]).all(axis=1)
     first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
-    if last - first < 2 or not _moving(rec):
+    if last - first < 2 or not rec.vehicles:
         raise InputError(
             "log",
             log.summary.name,
@@ -116,7 +116,7 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:
     Raises:
         InputError: a vehicle that has neither a fix nor sees a landmark in the first seconds, nor a true pose.
     """
-    rec, truth, moving = log.recording, log.truth, _moving(log.recording)
+    rec, truth, moving = log.recording, log.truth, log.recording.vehicles
     assert rec.body is not None
     if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
         return None, None, ""
@@ -129,10 +129,6 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:
         if not np.isfinite(poses[moving]).all():
             raise
         return poses, TRUE_POSE_STD, ", from the truth's first poses"
-
-
-def _moving(rec: Recording) -> list[int]:
-    return [k for k in range(len(rec.ids)) if k not in rec.landmarks]
 
 
 def without_wild(c: Check) -> Check:
@@ -172,7 +168,7 @@ def filtered(log: Log) -> Check:
         track = Kalman(robust=False)(rec, followed)
     else:
         begin, spread, start = begin_of(log)
-        track = PoseFilter("solo", gate=GATE_STDS, begin=begin, spread=spread)(rec, _moving(rec))
+        track = PoseFilter("solo", gate=GATE_STDS, begin=begin, spread=spread)(rec, rec.vehicles)
     columns, squares = list(track.egos), normalised_innovations(track, rec)
     assert squares is not None
     assert track.covariance is not None

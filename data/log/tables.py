@@ -103,7 +103,7 @@ def _long(
     frame = frame.assign(kind=words(frame, "kind", file))
     left = frame["kind"].isin(ignore)
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
-        summary.leave(f"kind {kind}, as ignore= asks", int(count))
+        summary.unused[f"kind {kind}, as ignore= asks"] += int(count)
     frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
     strange = frame["kind"][~frame["kind"].isin(KINDS)]
     if len(strange):
@@ -142,7 +142,7 @@ def _wide(
         like = near or suggestion(column, (*LONG, *KINDS), "")
         if column == "std":
             like = f"which belongs to no kind (name it {next(iter(columns))}_std)"
-        summary.leave(f"{file}: column {column}{', ' * bool(like)}{like}", len(frame))
+        summary.unused[f"{file}: column {column}{', ' * bool(like)}{like}"] += len(frame)
     return pd.concat(
         _cells(frame[filled(frame[name])].assign(kind=kind, **partner), file, name, f"{name}_std")
         for name, (kind, partner) in columns.items()

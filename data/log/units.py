@@ -1,5 +1,6 @@
 """Kinds of measurements in a log and their units, the table of its rows, and the counts of what became of them."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -256,7 +257,7 @@ class Summary:
     vehicles: dict[str, str] = field(default_factory=dict)
     read: dict[str, int] = field(default_factory=dict)
     refused: dict[str, tuple[int, str]] = field(default_factory=dict)
-    unused: dict[str, int] = field(default_factory=dict)
+    unused: Counter[str] = field(default_factory=Counter)
     odometry: float = 0.0
     rows: int = 0
     shown: list[str] = field(default_factory=list)
@@ -274,10 +275,6 @@ class Summary:
         if number:
             before, first = self.refused.get(reason, (0, where if isinstance(rows, int) else row_of(rows)))
             self.refused[reason] = before + number, first
-
-    def leave(self, what: str, number: int) -> None:
-        """Add to what was not meant to be read."""
-        self.unused[what] = self.unused.get(what, 0) + number
 
     def assume(self, sentence: str, name: str = "") -> None:
         """Add a sentence, once, and a name that takes the place of its {}."""

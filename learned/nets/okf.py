@@ -8,14 +8,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc import InputError, Recording, Track
-from coopoc.arrays import Floats, check_fields, checked, refuse, seed_of
+from coopoc import Recording, Track
+from coopoc.arrays import Floats, check_fields, seed_of
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.gaps import in_stretches
 from coopoc.methods.kalman import solo_filter, solo_track
-from coopoc.methods.noise_model import check_interval
+from coopoc.methods.noise_model import check_interval, check_std
 from coopoc.methods.stream import FilterStream
 from coopoc.methods.track import Alone
 from coopoc.text import short_repr
@@ -54,13 +54,10 @@ class OptimisedKF(Alone):
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        for field in ("process_std", "velocity_ratio", "gnss_std"):
-            value = checked(field, getattr(self, field), "(3,)", (3,))
-            wrong = ~(np.isfinite(value) & (value >= 0))
-            refuse(field, value, wrong, "must be finite and >= 0", "Take load_method('okf').")
+        check_std(self, "process_std", 0.0)
+        check_std(self, "velocity_ratio", 0.0)
+        check_std(self, "gnss_std")
         check_fields(self)
-        if min(self.gnss_std) == 0:
-            raise InputError("gnss_std", self.gnss_std, "must be > 0", "Assumed noise may not be zero.")
 
     def start(self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
         """The filter as a stream, one step at a time (docs/streaming.md).
