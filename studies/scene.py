@@ -114,7 +114,7 @@ def _there(data: str) -> Bools:
     standing = (np.nan_to_num(log.recording.velocity[0]) == 0).all(axis=(0, 2))
     if not standing.all():
         there &= ~standing  # a road-side unit knows where it is
-    return there if log.truth is None else np.asarray(there & log.truth.present)
+    return there if log.truth is None else there & log.truth.present
 
 
 LASTING_SHARES = ("own_share", "common_share")

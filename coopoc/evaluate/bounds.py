@@ -17,7 +17,7 @@ from ..kernels.stars.messages import FORGOTTEN
 from ..workers import one_thread, progress_bar
 from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet, columns, same_drive
-from ..world.links import Links, spherical
+from ..world.links import Links, directions, spherical
 from ..world.recording import Recording, Vehicles
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
@@ -395,9 +395,8 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     measured of range, azimuth and inclination."""
     away, azimuth, inclination = spherical(*edges.vector.T)
     flat = np.maximum(np.hypot(*edges.vector[:, :2].T), MIN_GROUND_DISTANCE)
-    sa, ca, si, ci, none = np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination), 0.0 * away
-    rows = [[si * ca, si * sa, ci], [-sa / flat, ca / flat, none], [ci * ca / away, ci * sa / away, -si / away]]
-    gradients = np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    metres = np.stack([np.ones_like(away), flat, away], axis=1)
+    gradients = directions(azimuth, inclination) / metres[..., None]
     weight = np.square(std) ** -1.0 * edges.measured
     return np.asarray(gradients.swapaxes(1, 2) @ (weight[..., None] * gradients))
 
@@ -456,4 +455,4 @@ def _smoothed(cov: Floats, stage: Stage, later: Floats) -> Floats:
     """The covariance one step before that of `later`, with all that is known there."""
     before, now, motion, moved = _moved(cov, stage)
     gain = cov[:, before] @ motion.T @ np.linalg.inv(moved)
-    return np.asarray(cov + gain @ (later[np.ix_(now, now)] - moved) @ gain.T)
+    return cov + gain @ (later[np.ix_(now, now)] - moved) @ gain.T

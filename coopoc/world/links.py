@@ -131,18 +131,23 @@ def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     >>> np.diag(vector_cov(np.array([0.5, 0.0, np.pi / 2]), np.array([1.0, 0.2, 0.2]))).round(6)
     array([1.  , 0.01, 0.01])
     """
-    az, inc = relative[..., 1], relative[..., 2]
-    d = np.maximum(relative[..., 0], min_range)
-    sa, ca, si, ci = np.sin(az), np.cos(az), np.sin(inc), np.cos(inc)
-    zero = np.zeros_like(d)
-    columns = [
-        [std[0] * si * ca, std[0] * si * sa, std[0] * ci],
-        [-std[1] * d * si * sa, std[1] * d * si * ca, zero],
-        [std[2] * d * ci * ca, std[2] * d * ci * sa, -std[2] * d * si],
-    ]
-    root = np.stack([np.stack(c, axis=-1) for c in columns], axis=-1)
-    cov: Floats = root @ np.swapaxes(root, -1, -2)
+    d, azimuth, inclination = np.moveaxis(relative, -1, 0)
+    reach = np.maximum(d, min_range)
+    metres = std * np.stack([np.ones_like(d), reach * np.sin(inclination), reach], axis=-1)
+    root = metres[..., None] * directions(azimuth, inclination)
+    cov: Floats = np.swapaxes(root, -1, -2) @ root
     return cov
+
+
+def directions(azimuth: Floats, inclination: Floats) -> Floats:
+    """Unit vectors (..., 3, 3), by rows, along which range, azimuth and inclination grow.
+
+    >>> directions(np.array(0.0), np.array(np.pi / 2)).round().tolist()
+    [[1.0, 0.0, 0.0], [-0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]
+    """
+    sa, ca, si, ci = np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination)
+    rows = [[si * ca, si * sa, ci], [-sa, ca, 0.0 * sa], [ci * ca, ci * sa, -si]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def stretches(flags: Bools) -> list[tuple[int, int]]:

@@ -399,7 +399,7 @@ def against_truth(c: Check) -> Check:
         return c
     marks = np.isin(np.arange(len(rec.ids)), rec.landmarks)
     off, (_, _, velocity), _ = causes(c)
-    fits = np.less([_beside(*one) for one in zip(off.T, velocity.T, strict=True)], 3 * c.fix_noise)
+    fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
     if c.log.recording.body is None:
@@ -410,9 +410,9 @@ def against_truth(c: Check) -> Check:
         residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
     used = np.isfinite(residual)
     relative = np.where(used, residual, c.relative)
-    fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)  # of others nothing is known
-    expected = np.where(used, stated, c.expected)
-    return replace(c, relative=np.where(fit[:, None], relative, np.nan), expected=expected)
+    fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)
+    relative[~fit] = np.nan  # of others nothing is known
+    return replace(c, relative=relative, expected=np.where(used, stated, c.expected))
 
 
 def on_time(c: Check, alike: bool) -> Check:

@@ -165,7 +165,7 @@ def _nowhere(rows: Rows) -> Bools:
     away = pace.where(leap).groupby(vehicle).transform("min") > most
     away &= usual.groupby(vehicle).transform("sum") >= LOCATING_FIXES
     none = fixes.set_index(key).index[no_degrees | (at_zero & away)]
-    return np.asarray(rows.set_index(key).index.isin(none) & in_group(rows, "fix"))
+    return rows.set_index(key).index.isin(none) & in_group(rows, "fix")
 
 
 def assumed(

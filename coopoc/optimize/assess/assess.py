@@ -370,7 +370,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
         if factor.loss is None:
             continue
         square = squared(problem, factor, x)
-        beyond = np.asarray(factor.loss.weight(square)) < INLIER_WEIGHT
+        beyond = factor.loss.weight(square) < INLIER_WEIGHT
         count = int(beyond.sum())
         spent += 0.5 * float(factor.loss.cost(square[beyond]).sum())
         if count:
