@@ -48,7 +48,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             summary.refuse("lines of NMEA files that are no sentence", int(bool(line.strip())), where)
             continue
         try:
-            sentence: Any = NMEAReader.parse(line[start:].strip() + b"\r\n")
+            sentence = NMEAReader.parse(line[start:].strip() + b"\r\n")
             if sentence is None:
                 raise ValueError("incomplete")
             reason = sentences.add(sentence, number)

@@ -164,7 +164,7 @@ def _opened(path: Path) -> Any:
 
 def _card(file: Any, path: Path | str) -> dict[str, Any]:
     try:
-        card: Any = json.loads((file.metadata() or {}).get("card", "null"))
+        card = json.loads((file.metadata() or {}).get("card", "null"))
     except (ValueError, RecursionError) as error:
         raise InputError("checkpoint", path, f"has a damaged card ({error})", "Train it again.") from None
     if not isinstance(card, dict):

@@ -58,7 +58,7 @@ def study(
 
     text = f"RT-LE [m]{', rms over runs' * (number is rms)}."
     nees = across(partial(mean, value="nees"), methods)
-    usual: dict[str, Any] = {
+    usual = {
         "grid": [of(*pair, **case) for case in cases.values() for pair in pairs],
         "shares": tuple(next(iter(cases.values()))),
         "tables": {

@@ -204,7 +204,7 @@ def bound_rows(p: Params) -> list[Row]:
         level = bound_rt_le(posterior_bound(drive, acting, column, v2x, past=past, recording=clean))
         near = len(find_links(drive, [column], v2x, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
-        row: Row = {"run": 0, "ego": ego, "rt_le_m": level}
+        row = {"run": 0, "ego": ego, "rt_le_m": level}
         rows_of_egos.append(row | {"bytes_per_second": received, "payload_bytes_per_second": received})
     return rows_of_egos
 

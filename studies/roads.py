@@ -126,7 +126,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
             ratios.append(nees[0, max(start - begin, 0) :, 0])
         blocks += blocks_of(np.sqrt(squares)[:, None], start, size).ravel().tolist()
         axis[recording.ids[column]] = round(float(np.sqrt(np.nanmean(squares[start:]) / 2)), 4)
-    row: Row = {"rt_le_m": rounded(np.array(blocks)), "axis_rms_m": axis, "blocks_m": np.round(blocks, 4).tolist()}
+    row = {"rt_le_m": rounded(np.array(blocks)), "axis_rms_m": axis, "blocks_m": np.round(blocks, 4).tolist()}
     if np.isfinite(nees := np.concatenate(ratios)).any():
         row["nees"] = round(np.nanmean(nees), 2)
     return row | {"microseconds_per_step": round(1e6 * seconds / len(recording.t), 2)}

@@ -108,7 +108,7 @@ def _there(data: str) -> Bools:
     log = _log(data)
     if log is None:
         return fleet(data).present
-    moving: Bools = np.isfinite(log.recording.velocity[0, :, :, 0])
+    moving = np.isfinite(log.recording.velocity[0, :, :, 0])
     started = np.maximum.accumulate(np.isfinite(log.recording.gnss[0, :, :, 0]), axis=0)
     there = moving & started
     standing = (np.nan_to_num(log.recording.velocity[0]) == 0).all(axis=(0, 2))

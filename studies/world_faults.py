@@ -136,8 +136,7 @@ def _slip(scene: Scene, rng: Draws) -> Made:
 
 def _during(recording: Recording, when: Bools, columns: Ints | tuple[int, ...]) -> Bools:
     """(T, N, 1) True of some vehicles at some steps."""
-    during: Bools = (when[:, None] & np.isin(np.arange(len(recording.ids)), columns))[..., None]
-    return during
+    return (when[:, None] & np.isin(np.arange(len(recording.ids)), columns))[..., None]
 
 
 def _outage(scene: Scene, rng: Draws, start: bool) -> Made:

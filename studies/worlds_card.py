@@ -69,7 +69,7 @@ def world_row(name: str, split: Split, params: Params) -> list[Row]:
     if not np.isfinite(level[name]):
         raise InputError("estimates", level[name], "must be finite", "Estimate every ego at every step.")
     track = tracks[name]
-    row: Row = {"kinds": "; ".join(drawn.kinds), "noted": float(bool(track.notes)), "rt_le_m": level[name]}
+    row = {"kinds": "; ".join(drawn.kinds), "noted": float(bool(track.notes)), "rt_le_m": level[name]}
     row |= {"joint_m": level[JOINT], "alone_m": level[ALONE]}
     if track.covariance is not None:
         each = nees(track, drawn.fleet, method=name)

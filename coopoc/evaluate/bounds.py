@@ -184,7 +184,7 @@ def _bound(
     if instance("smoothing", smoothing, bool, "Give True for the bound of a smoother."):
         require_white(sensors, "the smoothing bound")
     runs = [None] if recording is None else _measured(fleet, links, np.unique(np.concatenate(members)), recording)
-    total: Floats = np.zeros(())
+    total = np.zeros(())
     for run in runs:
         stages = position_stages(fleet, sensors, links, members, run)
         total = total + _marginals(fleet, stages, smoothing)[..., :3, :3]

@@ -1,7 +1,7 @@
 """Pictures of recordings, tracks and solutions in the plane: axes in metres, covariance ellipses, pairs of points."""
 
 import io
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -193,7 +193,7 @@ def ellipses(ax: "Axes", center: Floats, covariance: Floats, color: str, label: 
         values, axis = np.linalg.eigh(covariance[k])
         width, height = 2.0 * np.sqrt(SHARE_95 * np.maximum(values, 0.0))
         angle = float(np.degrees(np.arctan2(axis[1, 0], axis[0, 0])))
-        look: dict[str, Any] = {"facecolor": color, "edgecolor": color, "alpha": 0.22, "linewidth": 0.8}
+        look = {"facecolor": color, "edgecolor": color, "alpha": 0.22, "linewidth": 0.8}
         ax.add_patch(Ellipse(tuple(center[k]), width, height, angle=angle, label=label, **look))
         label = None
     ax.autoscale_view()

@@ -100,7 +100,7 @@ def over_seeds(values: AnyArray) -> Interval:
     values = checked("values", values)
     if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
-    means: Floats = values.reshape(len(values), -1).mean(axis=1)
+    means = values.reshape(len(values), -1).mean(axis=1)
     mean = float(means.mean())
     half = float(special.stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / np.sqrt(len(means)))
     return Interval(mean, mean - half, mean + half, len(means))
@@ -124,7 +124,7 @@ def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
 
 def _checked(name: str, values: AnyArray) -> Floats:
     """(E, R), egos first."""
-    array: Floats = np.atleast_2d(checked(name, values).T)
+    array = np.atleast_2d(checked(name, values).T)
     if array.ndim != 2 or array.size == 0:
         raise InputError(name, array.T.shape, "must have shape (R, E) or (R,)", "Runs first, then egos.")
     refuse(name, array.T, ~np.isfinite(array.T), "must be finite", "Leave out failed cells before you average.")

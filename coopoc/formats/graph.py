@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import InitVar, dataclass, fields
 from functools import cached_property
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +41,7 @@ class Edges:
 
     def __post_init__(self) -> None:
         for field in fields(self):  # type: ignore[arg-type]
-            dtype: Any = np.int64 if field.name == "nodes" else np.float64
+            dtype = np.int64 if field.name == "nodes" else np.float64
             object.__setattr__(self, field.name, frozen(getattr(self, field.name), dtype))
         if not len(self.stamps):
             self.__dict__["stamps"] = frozen(np.full(len(self.nodes), np.nan))
@@ -247,7 +246,7 @@ def check(graph: Graph, location: Location) -> None:
     n, d = len(graph.names), graph.dimension
     if not n:
         raise InputError("names", "0 vertices", "must be at least one", "Check that the file is complete.")
-    kinds: dict[str, Edges] = {field: getattr(graph, field) for field in ENDS}
+    kinds = {field: getattr(graph, field) for field in ENDS}
     wanted = {"is_pose": (n,), "position": (n, d), "orientation": (n, 1 if d == 2 else 4), "stamps": (n,)}
     for field, edges in kinds.items():
         wanted |= {f"{field}.{name}": shape for name, shape in shapes(field, d, len(edges)).items()}
@@ -309,7 +308,7 @@ def _values(edges: Edges, field: str, location: Location) -> None:
     >>> _values(PointEdges([[0], [0]], np.zeros((2, 2)), exact), "point_prior", str)
     """
     for name in [n for n in shapes(field, 2, 0) if n not in ("nodes", "stamps")]:
-        values: Floats = getattr(edges, name).reshape(len(edges), -1)
+        values = getattr(edges, name).reshape(len(edges), -1)
         mend, actual = "Correct the number.", f"{name} "
         _refuse(location, field, ~np.isfinite(values).all(axis=1), values, "must be finite", mend, actual)
         if name in ("distance", "variance"):
@@ -324,7 +323,7 @@ def _values(edges: Edges, field: str, location: Location) -> None:
         if name == "orientation":
             _unit(getattr(edges, name), field, location)
         if name == "covariance":
-            covariance: Floats = getattr(edges, name)
+            covariance = getattr(edges, name)
             eigenvalues = np.linalg.eigvalsh(covariance)
             least = MATRIX_ROUNDING * np.maximum(eigenvalues[:, -1], 0)
             uneven = np.abs(covariance - covariance.swapaxes(-1, -2)).max(axis=(-2, -1))

@@ -77,7 +77,7 @@ class BatchSmoother(Checked):
         start, _, noise = solo_filter(recording, range(len(recording.ids)), model, fix_noise(model, robust))
         fix = noise if robust else model.fix_variance(recording)
         stds = [np.sqrt(np.broadcast_to(v, start.shape)) for v in (fix, model.process_variance(recording))]
-        cov: Floats = np.full((*start.shape, 3), np.nan)
+        cov = np.full((*start.shape, 3), np.nan)
         x = np.full_like(start, np.nan)
         for run in progress_bar(range(len(x)), desc=self.name, unit="run", delay=2.0):
             there = active[run]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats, Ints
 from ..kernels.compiling.waiting import clock
 from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
@@ -68,7 +68,7 @@ def follow_egos(
                 for name, values in result.extras.items():
                     extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(result.step, int) else len(recording.t[result.step]))
-    absent: Bools = np.logical_and.accumulate(np.isnan(x[..., 0]).any(axis=0))  # a later NaN is an error
+    absent = np.logical_and.accumulate(np.isnan(x[..., 0]).any(axis=0))  # a later NaN is an error
     stated = getattr(method, "noise_model", "nominal")
     notes = (*notes, *doubts(recording, columns, x, cov, stated, neighbours, notes))
     for array in (x, cov, neighbours):

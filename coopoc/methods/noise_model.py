@@ -152,7 +152,7 @@ class NoiseModel:
         velocity, links, dt = recording.velocity, recording.links, recording.dt
         followed = slice(None) if columns is None or inbox is not None else columns
         if self.process_std is not None:
-            variance: Floats = np.square(self.process_std)[None, None, None]
+            variance = np.square(self.process_std)[None, None, None]
         elif self.fleet is not None and self.sensors is not None:
             same_drive(self.fleet, recording.ids, recording.t)
             variance = np.square(dt * self.sensors.velocity_std(self.fleet.velocity[None, :, followed], 1e-6))

@@ -96,7 +96,7 @@ def stars(
         position, variance = fixes[run, s, member] + age * moved, variances[run, s, member]
         variance = variance + age * (growth[0] * age + growth[1]) * step_variance
         position[:, 0], variance[:, 0] = recording.gnss[:, t, ego], r[:, t, ego]
-        known_position: Bools = held & np.isfinite(position).all(axis=-1)
+        known_position = held & np.isfinite(position).all(axis=-1)
         yield StarStep(
             t,
             member,

@@ -202,7 +202,7 @@ class StarStream:
         names = _names(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         columns, own, time = self._columns(names), np.empty(OWN), self._time + float(dt)
-        rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
+        rows = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
         outcome = stream_rows(
             self._given,
             self.history.reserve(),

@@ -75,7 +75,7 @@ class Track:
         self.__dict__["egos"] = tuple(egos.tolist())
         x = checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
         runs, steps = x.shape[:2]
-        shapes: dict[str, tuple[str, tuple[int, ...]]] = {
+        shapes = {
             "t": ("(T,)", (steps,)),
             "x": ("(R, T, E, 3)", (runs, steps, len(egos), 3)),
             "covariance": ("(R, T, E, 3, 3)", (*x.shape, 3)),

@@ -190,7 +190,7 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
     d, factors = graph.dimension, list[Factor]()
     for name, kind in MEASUREMENT_KINDS.items():
-        edges: Any = getattr(graph, name)
+        edges = getattr(graph, name)
         if not len(edges):
             continue
         turns = kind in ("relative_pose", "pose")

@@ -145,7 +145,7 @@ def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:
         if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node):
             node.body = node.body[1:] or [ast.Pass()]
     texts.add(ast.unparse(tree))
-    names: dict[str, Any] = dict(vars(module))
+    names = dict(vars(module))
     if isinstance(thing, FunctionType):
         names |= inspect.getclosurevars(thing).nonlocals
 

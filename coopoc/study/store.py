@@ -51,7 +51,7 @@ def content(
         raise InputError("folder", str(path.parent), f"holds no {path.name}", hint)
     try:
         text = path.read_text("utf-8")
-        document: Any = json.loads(text)
+        document = json.loads(text)
         if "\\ud" in text.lower():
             json.dumps(document, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
     except (ValueError, RecursionError) as error:

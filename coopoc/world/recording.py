@@ -56,7 +56,7 @@ class Body:
     __reduce__ = remade
 
     def __post_init__(self) -> None:
-        shape: tuple[int, ...] = (-1, -1, -1)
+        shape = (-1, -1, -1)
         for name in ("yaw_rate", "heading"):
             self.__dict__[name] = checked(name, getattr(self, name), "(R, T, N)", shape)
             shape = self.yaw_rate.shape
@@ -137,7 +137,7 @@ class Recording:
             instance(name, getattr(self, name), kind)
         ids, t, links = names(self.ids), clock(self.t), len(self.links)
         gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
-        shapes: dict[str, tuple[str, tuple[int, ...], Any]] = {
+        shapes = {
             "velocity": ("(R, T, N, 3)", gnss.shape, float),
             "relative": ("(R, L, 3)", (len(gnss), links, 3), float),
             "broadcasts": ("(T, N)", gnss.shape[1:3], bool),
@@ -260,7 +260,7 @@ class Recording:
         (col,) = columns("vehicle", [vehicle], self.ids)
         least = number("shortest", shortest, kind=int)
         there = np.isfinite(self.velocity[0, :, col, 0])
-        has_fix: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
+        has_fix = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
         firsts = [(a + int(np.argmax(has_fix[a:b])), b) for a, b in stretches(there) if has_fix[a:b].any()]
         return tuple((a, b) for a, b in firsts if b - a >= least)
 
@@ -436,7 +436,7 @@ def _contradicting(recording: Recording) -> float:
     body, stated = recording.body, float(np.hypot(*recording.sensors.fix_std[:2]))
     lag = max(1, min(len(recording.t) - 1, round(COMPARED_SECONDS / recording.dt)))
     fixes, u = (values[0, ..., :2] @ [1, 1j] for values in (recording.gnss, recording.velocity))
-    heading: Floats = np.zeros(u.shape)
+    heading = np.zeros(u.shape)
     turned = heading
     if body is not None:
         heading, turned = body.heading[0], np.cumsum(np.nan_to_num(body.yaw_rate[0]), axis=0) * recording.dt

@@ -118,7 +118,7 @@ class Sensors:
         size = np.abs(velocity)
         if self.velocity_reading == "speed":
             size = np.broadcast_to(np.linalg.norm(velocity, axis=-1, keepdims=True), velocity.shape)
-        std: Floats = self.velocity_std_ratio * size
+        std = self.velocity_std_ratio * size
         return np.maximum(std, floor or 0.0, out=std)
 
     def motion_noise(self, interval: float = 0.0) -> "MotionNoise":

@@ -152,7 +152,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         if not max(np.nanmax(speed, initial=0.0), *(fixes.max() - fixes.min())) > 0:  # a place
             continue
         wheels, ratio = odometry(c, column), ratio_of_moves(c, column)
-        row: dict[str, Any] = {
+        row = {
             "vehicle": name,
             "fixes": int(fixes[0].count()),
             "there": float(np.isfinite(speed).mean()),
@@ -386,7 +386,7 @@ def _of_fixes(c: Check) -> list[str]:
     off, made, then = causes(c)
     usual = c.fix_noise
     for column, name in enumerate(rec.ids):
-        row: Mapping[str, Any] = next((row for row in c.vehicles if row["vehicle"] == name), {})
+        row = next((row for row in c.vehicles if row["vehicle"] == name), {})
         finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
         every_one = np.zeros(finite.sum(), int)
         shown = truth is None and c.shown(column)

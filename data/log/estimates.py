@@ -190,7 +190,7 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
 def ratio_of_moves(c: Check, column: int) -> complex | None:
     """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
     moved, driven, *_ = moves(c, column)
-    ratio: complex = np.vdot(driven, moved) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
+    ratio = np.vdot(driven, moved) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
     most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - LEAST_CORRELATION**2) ** 0.5 * np.linalg.norm(moved))
     return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
 

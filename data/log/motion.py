@@ -177,8 +177,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         summary.assume("heights of {} are 0: none were logged, or few", name)
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
-    still: Floats = np.zeros((len(grid), 3))
-    none: Floats = np.full(len(grid), np.nan)
+    still = np.zeros((len(grid), 3))
+    none = np.full(len(grid), np.nan)
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = Course(unknown if body else heading_at(measured, None, np.inf))
@@ -342,7 +342,7 @@ def _heading(
         return derived
     sources = [("fixes", shown)]
     if world is not None:
-        none: Floats = np.zeros(len(world.t))
+        none = np.zeros(len(world.t))
         sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
@@ -386,7 +386,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     four of them at the latest, or as well as by two that are as far apart as nine in ten."""
     fixes, variance = way.fixes, way.std**2
     if len(fixes.t) < 2:
-        none: Floats = np.zeros(len(fixes.t))
+        none = np.zeros(len(fixes.t))
         return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), none > 0, 0.0, none)
     between = np.diff(fixes.t)
     interval, longest = float(np.median(between)), np.quantile(between, 0.9)

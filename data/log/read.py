@@ -191,7 +191,7 @@ def read_log(
             number(field, value, 1e-12, allowed="a number > 0 s", hint="Give seconds.")
     if origin is not None:
         check_origin(origin)
-    options: dict[str, Any] = {
+    options = {
         "columns": named("columns", columns or {}, "Give columns={name: header}."),
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,

@@ -9,7 +9,7 @@ import pandas as pd
 import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
-from coopoc.arrays import AnyArray, Bools, Floats, Ints
+from coopoc.arrays import AnyArray, Floats, Ints
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
 from coopoc.world.body_frames import in_world
 from coopoc.world.links import spherical, stretches, wrap
@@ -91,7 +91,7 @@ def together(log: Log) -> tuple[Log, str]:
         InputError: the vehicles share no two steps.
     """
     rec = log.recording
-    there: Bools = np.isfinite(rec.velocity[0][:, rec.vehicles, 0]).all(axis=1)
+    there = np.isfinite(rec.velocity[0][:, rec.vehicles, 0]).all(axis=1)
     first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
     if last - first < 2 or not rec.vehicles:
         raise InputError(

@@ -102,5 +102,4 @@ def _array(tensor: Tensor, dtype: torch.dtype) -> AnyArray:
     """The same numbers as a contiguous array, without a copy where possible."""
     if tensor.dtype != dtype or not tensor.is_contiguous() or tensor.requires_grad:
         tensor = tensor.detach().to(dtype).contiguous()
-    array: AnyArray = tensor.numpy()
-    return array
+    return tensor.numpy()

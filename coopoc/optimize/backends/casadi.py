@@ -68,7 +68,7 @@ def solver(
         )
     nlp = programme(form, int(max_iterations), get_ident())
     space, free, count = form.space, form.movable, 0
-    multipliers: Any = 0.0
+    multipliers = 0.0
     for _ in range(10):  # for poses again around the answer until it stays
         end = nlp(p=_numbers(problem, x), lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
@@ -115,7 +115,7 @@ def programme(structure: Structure, max_iterations: int, thread: int) -> Any:
 
     symbols, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**symbols, "p": ca.vertcat(symbols["p"], scale), "f": scale * symbols["f"]}
-    options: dict[str, Any] = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
+    options = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
     return ca.nlpsol("solver", "ipopt", nlp, options)
 
 

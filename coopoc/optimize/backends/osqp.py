@@ -154,7 +154,7 @@ def _programme(problem: Problem, layout: Layout) -> Programme:
 
     entries = layout.entries
     pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
-    matrix: Any = csc_matrix((0, entries.size))
+    matrix = csc_matrix((0, entries.size))
     if problem.constraints:
         rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
         matrix = csc_matrix(rows.matrix)[:, entries.number.ravel() >= 0]

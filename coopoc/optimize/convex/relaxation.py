@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -116,7 +115,7 @@ def semidefinite(
 
     It takes C (bound, bound) and returns the multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
     """
-    cvxpy: Any = importlib.import_module("cvxpy")
+    cvxpy = importlib.import_module("cvxpy")
     (n, k), (m, q) = stiefel, sphere
     size = n * k + m * q
     Z, C = cvxpy.Variable((size, size), PSD=True), cvxpy.Parameter((size, size), symmetric=True)

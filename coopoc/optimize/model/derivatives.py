@@ -125,7 +125,7 @@ def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
     measurement, space = kind.measurement, kind.space
     arity, (z_width, constants, _) = measurement.arity, kind.widths
     nodes, steps = ca.SX.sym("nodes", arity * space.ambient), ca.SX.sym("steps", arity * space.dof)
-    number: Any = ca.SX.sym("number", sum(kind.widths))
+    number = ca.SX.sym("number", sum(kind.widths))
     all_nodes, all_steps, numbers = (ca.vertsplit(each) for each in (nodes, steps, number))
     places = [
         _moved(space, all_nodes[k * space.ambient :][: space.ambient], all_steps[k * space.dof :][: space.dof])
@@ -149,7 +149,7 @@ def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
             gap = [ca.if_else(w != 0.0, w * g, 0.0) for g, w in zip(gap, weight, strict=True)]
         else:
             gap = [g * w for g, w in zip(gap, weight, strict=True)]
-        white: Any = ca.vertcat(*gap)
+        white = ca.vertcat(*gap)
     except Exception as problem:  # the formula is the user's, who must learn what it raised
         hint, why = "Take its functions from the namespace m, such as m.sqrt.", " ".join(str(problem).split())[:80]
         raise InputError("kind", repr(measurement.name), f"must run on CasADi's numbers: {why}", hint) from problem
@@ -170,8 +170,8 @@ def expressions(structure: Structure) -> dict[str, Any]:
 
     space, n = structure.space, structure.nodes
     centre = ca.SX.sym("centre", n, space.ambient)
-    steps: Any = ca.SX.sym("dx", int(structure.movable.sum()))
-    step: Any = ca.SX.zeros(n, space.dof)
+    steps = ca.SX.sym("dx", int(structure.movable.sum()))
+    step = ca.SX.zeros(n, space.dof)
     for k, (i, j) in enumerate(np.argwhere(structure.movable).tolist()):
         step[i, j] = steps[k]
 

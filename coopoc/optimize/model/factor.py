@@ -240,7 +240,7 @@ def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
 def _joined(factors: list[Factor]) -> Factor:
     if len(factors) == 1:
         return factors[0]
-    changes: dict[str, Floats] = {"nodes": np.concatenate([factor.nodes for factor in factors])}
+    changes = {"nodes": np.concatenate([factor.nodes for factor in factors])}
     for name in ("z", "std", "sqrt_information", "constants"):
         arrays = [getattr(factor, name) for factor in factors]
         if arrays[0] is not None:

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, checked, frozen, refuse
+from ...arrays import Floats, Ints, checked, frozen, refuse
 from ...errors import InputError
 from .measurements import Measurement
 from .space import Space
@@ -26,7 +26,7 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
     flat = array.reshape(-1, *array.shape[-2:])
     mirrored = np.isclose(flat, np.swapaxes(flat, 1, 2), rtol=1e-6, atol=1e-300) & np.isfinite(flat)
     least = np.full(len(flat), np.nan)
-    symmetric: Bools = np.asarray(mirrored.all(axis=(1, 2)))
+    symmetric = np.asarray(mirrored.all(axis=(1, 2)))
     least[symmetric] = np.linalg.eigvalsh(flat[symmetric])[:, 0]
     if not (least > 0).all():
         k = int(np.flatnonzero(~(least > 0))[0])

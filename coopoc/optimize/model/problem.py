@@ -108,7 +108,7 @@ class Problem:
             self.__dict__[field] = tuple(self.index(node) for node in getattr(self, field))
         self.__dict__["shown"] = self.index(self.shown) if self.names else 0
         self.__dict__["dimension"] = int(Space(self.dimension).dimension)  # 2 or 3
-        items: tuple[object, ...] = (*self.factors, *self.constraints)
+        items = (*self.factors, *self.constraints)
         for item in items:
             if not isinstance(item, Factor | Constraint):
                 hint = "Add measurements with Problem.add, constraints with Problem.constrain."
@@ -223,7 +223,7 @@ class Problem:
         """
         number = np.cumsum(used) - 1
         kept = [taken(factor, own) for factor, own in zip(self.factors, rows, strict=True) if len(own)]
-        changes: dict[str, Any] = {
+        changes = {
             name: tuple(number[[k for k in getattr(self, name) if used[k]]].tolist()) for name in ("poses", "fixed")
         }
         changes["names"] = tuple(compress(self.names, used))
