@@ -17,7 +17,7 @@ Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 AnyArray: TypeAlias = npt.NDArray[Any]
 
-DTYPE_KINDS: dict[Any, tuple[str, str]] = {
+DTYPE_KINDS = {
     float: ("fiu", "number"),
     int: ("iu", "whole number"),
     bool: ("b", "boolean"),

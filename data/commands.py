@@ -1,7 +1,6 @@
 """coopoc data list | get | show | check."""
 
 import sys
-from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -132,7 +131,7 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     print(f"picture: {out}", file=sys.stderr)
 
 
-COMMANDS: Mapping[str, Callable[..., None]] = {
+COMMANDS = {
     "list": list_,
     "get": get,
     "show": show,

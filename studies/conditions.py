@@ -75,7 +75,7 @@ PERFECT = {"latency_s": 0.0, "loss": 0.0, "burst": 1.0}
 ONE_BY_ONE, IN_RUNS = (
     {100 * loss: {**PERFECT, "loss": loss, "burst": burst} for loss in (0.1, 0.3, 0.6, 0.9)} for burst in (1.0, 10.0)
 )
-MESSAGES: Mapping[str, tuple[str, Mapping[float, Where]]] = {
+MESSAGES = {
     "late": ("s", {late: {**PERFECT, "latency_s": late} for late in (0.1, 0.3, 0.5, 1.0)}),
     "lost one by one": ("%", ONE_BY_ONE),
     "lost in runs of 10": ("%", IN_RUNS),

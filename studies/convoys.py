@@ -1,6 +1,5 @@
 """CL-Bench's convoys: errors of one real drive, cut into pieces, of vehicles that drive together; ranges are drawn."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +15,7 @@ from .pose_drives import BLOCK_SECONDS, MIN_BLOCKS, hashed
 from .roads import ROADS, thinned
 from .tasks import blocks_of, costs, located, planar, rounded
 
-CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
+CONVOYS = {f"convoy-{road}": road for road in ROADS}
 """Task -> road whose drive is cut."""
 PIECES, SHORTEST_PIECE, START_SPREAD, RUNS, SEED = 4, 25.0, 25.0, 4, 2026
 """Vehicles at most; s of a piece at least; m within which they start; draws of ranges and angles, and their seed."""

@@ -19,13 +19,13 @@ from .tasks import blocks_of, located, planar, rounded
 
 FIX_EVERY, OUTAGE_SECONDS, PERIOD_SECONDS = 10, 30.0, 180.0
 """One fix in so many is kept, and none in the last s of every period of s."""
-ROADS: Mapping[str, tuple[str, ...]] = {
+ROADS = {
     "f9k": ("ublox_f9k.nmea", "span_truth.gga"),
     "kitti": ("KITTI_00_ORB.txt", "KITTI_00_gt.txt"),
     "comma2k19": ("comma2k19",),
 }
 """Task -> files of the measurements and of the truth, or a folder of both."""
-PUBLISHED: Mapping[str, tuple[str, ...]] = {"nclt": ("test.pt",), "nclt-val": ("val.pt",)}
+PUBLISHED = {"nclt": ("test.pt",), "nclt-val": ("val.pt",)}
 """Task of drives that a net was published with -> the file, which is scored with all its fixes and steps."""
 EVERY_ROAD = {**ROADS, **PUBLISHED}
 COMMA_STEP = 0.1

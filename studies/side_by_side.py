@@ -10,7 +10,7 @@ from . import lineup, scene
 from .views import Plot, TableView, of, table
 
 DEFAULT_METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-filter", "bound")
-CONDITIONS: dict[str, Any] = {
+CONDITIONS = {
     "channel": "ideal",
     "rate_hz": None,
     "cap_bytes_per_second": None,

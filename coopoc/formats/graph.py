@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..text import short_repr
 from .values import MIN_DIAGONAL, QUATERNION_ROUNDING, to_rotation
 
-ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be
+ENDS = {  # what the vertices of each kind of edge must be
     "pose_prior": ("pose",),
     "point_prior": ("point",),
     "relative_pose": ("pose", "pose"),

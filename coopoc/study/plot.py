@@ -20,7 +20,7 @@ from ..paths import write
 from ..text import picture
 from .style import RC, line, look
 
-FIXED: Mapping[str, dict[str, Any]] = {
+FIXED = {
     "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
     "svg": {"Date": None, "Creator": None},
     "png": {"Software": None},

@@ -42,7 +42,7 @@ DATA = tomllib.loads((Path(__file__).parent / "style.toml").read_text("utf-8"))
 METHODS = {name: Look(*each) for name, each in DATA["methods"].items()}
 UNITS = {column: tuple(each) for column, each in DATA["columns"].items()}
 """Column -> (words, unit)."""
-RC: Any = DATA["matplotlib"]
+RC = DATA["matplotlib"]
 """Options of matplotlib."""
 CLIENTS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#4D4D4D")
 """Of the clients of one method, by number from 1."""

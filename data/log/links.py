@@ -14,7 +14,7 @@ from coopoc.world.sensing import schedule
 from .motion import COURSE, Member, Steps, stacked
 from .units import Rows, Summary, in_group, only, stated_std
 
-COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
+COMPONENTS = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
 LINK_COLUMNS = ["step", "observer", "neighbour"]
 NEAR_MOTIONS, NEAR_STDS = 10.0, 4.0
 """Distances, over what the two move until the step, and over the standard deviation of a fix, below both of which a

@@ -31,7 +31,7 @@ class Kind(NamedTuple):
     offset: float = 0.0
 
 
-KINDS: dict[str, Kind] = {
+KINDS = {
     **{name: Kind("fix", name) for name in ("x", "y", "z", "height")},
     "latitude": Kind("fix", "latitude", 90.0),
     "longitude": Kind("fix", "longitude", 180.0),

@@ -198,7 +198,7 @@ def _coupled(W: Floats, d: int) -> bool:
     return bool(max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max()) > WEIGHT_TOLERANCE * np.abs(W).max())
 
 
-FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
+FORMS = {
     **dict.fromkeys(PLAIN, _plain),
     "bearing": _bearing,
     "body_spherical": _bearing,

@@ -11,7 +11,6 @@ changes nothing; H = I picks the world's. A scalar weight w acts on all d column
 displacement weighs its axes differently the columns are stacked into one, X = [1; vec s; vec t], of d times the rows.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NoReturn
@@ -301,7 +300,7 @@ def _relative(rows: _Rows, factor: Factor) -> None:
         rows.add([-angular * turn, angular * np.eye(d)], [rows.rotation(i), rows.rotation(j)])
 
 
-TERMS: dict[str, Callable[[_Rows, Factor], None]] = {
+TERMS = {
     "position": _position,
     "displacement": _position,
     "range": _range,

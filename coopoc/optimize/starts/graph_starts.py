@@ -232,7 +232,7 @@ def file(graph: Graph) -> Floats:
     return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
 
 
-STARTS: dict[str, Callable[[Graph], Floats]] = {
+STARTS = {
     "odometry": chained,
     "file": file,
     "tree": tree,
