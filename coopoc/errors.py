@@ -48,14 +48,19 @@ def _cut(value: object) -> str:
 
 
 def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
-    """The hint for an unknown name: the nearest known one, or another hint if none is near; no single letter is.
+    """The hint for an unknown name: the nearest known one, or another hint if none is near; no single letter is, and
+    of several words each has to be near one of its words.
 
-    >>> suggestion("tracee", ("trace", "det"), "Pick one.")
-    'Did you mean trace?'
+    >>> suggestion("tracee", ("trace", "det"), "Pick one."), suggestion("range_rate", ("yaw_rate",), "Pick one.")
+    ('Did you mean trace?', 'Pick one.')
     """
     names = {one.lower(): one for one in known if len(one) > 1}  # else a quaternion's qx would be meant as x
-    near = difflib.get_close_matches((name if isinstance(name, str) else shown(name)).lower(), names, n=1)
-    return f"Did you mean {names[near[0]]}?" if near else otherwise
+    text = (name if isinstance(name, str) else shown(name)).lower()
+    words, near = text.split("_"), difflib.get_close_matches(text, names, n=1)
+    alike = len(words) == 1 or all(
+        difflib.get_close_matches(w, near[0].split("_"), cutoff=0.75) for w in words * len(near)
+    )
+    return f"Did you mean {names[near[0]]}?" if near and alike else otherwise
 
 
 def unknown(noun: str, name: object, names: Iterable[str], otherwise: str | None = None) -> InputError:

@@ -12,6 +12,8 @@ SAME_INSTANT = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
 MIN_TYPICAL_SPEED, MAX_TYPICAL_SPEED = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
+MAX_HEIGHT = 1e5
+"""m, beyond which a height is a coordinate from the centre of the earth."""
 REGION = 2.0
 """Degrees that a fleet spans at most; robots that stand in a room, and tremble in motion capture, are metres apart."""
 MIN_INSTANTS, MAX_INSTANTS_PER_ROW = 500_000, 200
@@ -163,7 +165,7 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
 
 
 def check_scale(paths: Sequence[tuple[Floats, Floats]], file: str) -> None:
-    """InputError where paths look like degrees, or move too fast for metres and seconds.
+    """InputError where paths look like degrees or ECEF, or move too fast for metres and seconds.
 
     The typical speed of a vehicle is the median of |dx| / dt over the pairs of rows between which it moves, that of a
     file the largest of its vehicles. A file in which nothing moves has none.
@@ -189,6 +191,13 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
             f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}",
             "look like degrees, must be metres in a local frame",
             "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.",
+        )
+    if (abs(np.concatenate([position[:, 2:] for _, position in paths])) > MAX_HEIGHT).any():
+        raise InputError(
+            f"{file}: column z",
+            f"beyond {MAX_HEIGHT:g} m",
+            "looks like ECEF, must be height in a local frame",
+            "Convert x, y, z to latitude, longitude and height, or pass any_scale=True.",
         )
     if speed > MAX_TYPICAL_SPEED:
         raise InputError(

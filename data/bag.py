@@ -12,7 +12,7 @@ import pandas as pd
 from coopoc.arrays import one_of
 from coopoc.errors import InputError, MissingLibraryError, said, unknown
 
-from .log.units import Rows, Summary, of_kinds
+from .log.units import QUATERNION, Rows, Summary, of_kinds
 
 ORIENTATION = "orientation.x orientation.y orientation.z orientation.w"
 POSE = "pose.position.x pose.position.y pose.position.z pose.orientation.x pose.orientation.y pose.orientation.z \
@@ -40,12 +40,12 @@ FIELDS = {
     "twist.covariance_35": "yaw_rate_std",
     "angular_velocity.z": "yaw_rate",
     "angular_velocity_covariance_8": "yaw_rate_std",
-    "orientation_covariance_8": "heading_std",
+    "orientation_covariance_8": "qw_std",
     "range": "range",
     **{f"pose.position.{axis}": axis for axis in "xyz"},
 }
 """Field, with the index in it -> kind, or the deviation whose variance it is; zeros mean unknown."""
-UNMEASURED = {"angular_velocity_covariance_0": "yaw_rate", "orientation_covariance_0": "heading"}
+UNMEASURED = {"yaw_rate": "angular_velocity_covariance_0"} | dict.fromkeys(QUATERNION, "orientation_covariance_0")
 """Field that is negative where a kind is not measured."""
 
 
@@ -129,7 +129,7 @@ def read_bag(
             (vehicle, partner), true = of[topic]
             kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
             rows = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), path.name)
-            parts[topic] = rows[~rows["kind"].isin(ignore)]
+            parts[topic] = rows[~rows["kind"].replace(QUATERNION, "heading").isin(ignore)]
     except InputError:
         raise
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all
@@ -198,10 +198,10 @@ def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> p
     summary.refuse(reason, int((~valid).sum()), where)
     topic = topic[valid]
     made = {"t": topic["t"]} | {kind: topic[name] for name, kind in FIELDS.items() if name in topic}
-    turn = (POSE if true else ORIENTATION).split()[-4:]
-    if {*turn} <= {*topic}:
-        made["heading"] = _yaw(*(topic[axis] for axis in turn))
-    for name, kind in UNMEASURED.items():
+    for kind, axis in zip(QUATERNION, (POSE if true else ORIENTATION).split()[-4:], strict=True):
+        if axis in topic:
+            made[kind] = topic[axis]
+    for kind, name in UNMEASURED.items():
         if name in topic and kind in made:
             made[kind] = made[kind].where(topic[name] >= 0)
     known_cov = topic.get("position_covariance_type", 1) != 0  # 0: the covariance is unknown
@@ -209,9 +209,3 @@ def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> p
         name: np.sqrt(each.where(known_cov & (each > 0))) for name, each in made.items() if name.endswith("_std")
     }
     return pd.DataFrame(made | deviations)
-
-
-def _yaw(x: Any, y: Any, z: Any, w: Any) -> Any:
-    """Rotation about z, rad; NaN for a quaternion that is none."""
-    whole = np.abs(x * x + y * y + z * z + w * w - 1) < 0.02
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)).where(whole)

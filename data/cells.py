@@ -40,6 +40,8 @@ USUAL_HEADERS = {
     "y": "northing north",
 }
 """Words in headers that others give to the columns, in wide tables."""
+OTHER_MEANINGS = {"rate", "vertical", "acc", "accel", "accuracy", "std", "sigma", "error", "variance", "cov"}
+"""Words beside which these mean something else."""
 
 
 LARGEST_TABLE = 2**27
@@ -213,12 +215,13 @@ def named_columns(
 def usual_key(header: str) -> str:
     """Our name of the column that a header of others has, by the words in it; "" for none.
 
-    >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "rank", "UTM_North")]
+    >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "yaw_acc", "UTM_North")]
     ['t', 'latitude', 'compass_deg', '', 'y']
     """
     pieces = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
     parts = {header.lower(), *(word.lower() for word in pieces)}
-    return next((key for key, usual in USUAL_HEADERS.items() if not parts.isdisjoint(usual.split())), "")
+    usual = (key for key, words in USUAL_HEADERS.items() if not parts.isdisjoint(words.split()))
+    return next(usual, "") if parts.isdisjoint(OTHER_MEANINGS) else ""
 
 
 def missing_column(

@@ -41,6 +41,7 @@ def nanoseconds(text: str) -> str:
 
 
 ROW3 = "0.0,red,vx,,8.0,0.1,"
+ECEF = "t,vehicle,x,y,z\n0,red,4176690,855230,4727230\n1,red,4176691,855230,4727230\n"
 DEGREES = "t,vehicle,x,y\n" + "".join(f"{k},red,{11.58 + 1e-5 * k},{48.14 + 2e-5 * k}\n" for k in range(20))
 SWAPPED = "t,vehicle,latitude,longitude\n0,red,116.39,39.9\n1,red,116.3901,39.9\n"
 MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
@@ -54,6 +55,7 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "a time of day without a date": (swap(ROW3, "12:00:01,red,vx,,8.0,0.1,"), {}, "row 3, column t"),
     "nanoseconds for seconds": (nanoseconds(GOOD), {}, "column t"),
     "degrees as x and y": (DEGREES, {}, "columns x, y"),
+    "positions from the centre of the earth": (ECEF, {}, "column z"),
     "latitude and longitude swapped": (SWAPPED, {}, "row 1, latitude"),
     "degrees in both frames": (GOOD + "0.0,blue,latitude,,48.1,1,\n0.0,blue,longitude,,11.5,1,\n", {}, "row 1, x"),
     "a bearing in degrees": (swap("range,blue,12.0", "bearing,blue,45"), {}, "row 5, bearing"),

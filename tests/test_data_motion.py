@@ -12,12 +12,14 @@ import pytest
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import coopoc as co
 from coopoc.arrays import Floats
 from coopoc.data.log.check import check
 from coopoc.data.log.read import Log
 from coopoc.kernels.constant_velocity import BANK, constant_velocity
+from coopoc.world.body_frames import in_world
 
 T = np.round(np.arange(0, 180, 0.1), 1)
 TUNNEL = [k for k in range(0, len(T), 10) if not 600 < k < 900]
@@ -105,6 +107,28 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, nam
     for method in FILTERS[: 2 + (name != "town")]:
         assert error(read, method) < 1.15 * best
     assert "the odometry, which they else follow" not in " ".join(check(read).warnings)
+
+
+@pytest.mark.parametrize("frame", ["world", "body"])
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_path, frame, apart):
+    """By SciPy's rotation; beside the filter that has the velocity in the world. Quaternions may be in a table of
+    their own."""
+    u, of = np.gradient(path("drone"), 0.1, axis=0), dict.fromkeys(("vx_std", "vy_std", "vz_std"), 0 * T + 0.1)
+    ideal = log(tmp_path / "world", "drone", 0.1, 10, vx=u[:, 0], vy=u[:, 1], vz=u[:, 2], **of)[0]
+    turn = Rotation.from_euler("ZYX", np.c_[0.3 * T, 0.2 * np.sin(T), 0.3 * np.cos(T)])
+    q = dict(zip(("qx", "qy", "qz", "qw"), turn.as_quat().T, strict=True))
+    of = {f"{name}_body_std": std for name, std in zip(("vx", "vy", "vz"), of.values(), strict=True)}
+    own = dict(zip(("vx_body", "vy_body", "vz_body"), turn.inv().apply(u).T, strict=True))
+    log(tmp_path / "body", "drone", 0.1, 10, **own, **of, yaw_rate=0 * T + 0.3, **({} if apart else q))
+    if apart:
+        pd.DataFrame(q).assign(t=T, vehicle="a").to_csv(tmp_path / "body/imu.csv", index=False)
+    read = co.read_log(tmp_path / "body", frame=frame)
+    assert "forward, y left, z up" in " ".join(read.recording.notes)
+    world = in_world(read.recording) if frame == "body" else read.recording
+    assert_allclose(world.velocity, ideal.recording.velocity, atol=0.03)
+    method = co.PoseFilter("solo") if frame == "body" else co.Kalman()
+    assert error(read, method) < 1.3 * error(ideal, co.Kalman())
 
 
 def test_each_fix_counts_as_it_is_stated(tmp_path):

@@ -10,18 +10,20 @@ import pymap3d
 
 from coopoc import InputError, Sensors
 from coopoc.arrays import Bools, Floats, checked, refuse
+from coopoc.formats.values import QUATERNION_ROUNDING, to_rotation
+from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD
 from ..cells import factors
-from .units import ANGLES, KINDS, Rows, Summary, in_group, only, row_of, stated_std
+from .units import ANGLES, BODY, KINDS, QUATERNION, Rows, Summary, in_group, only, row_of, stated_std
 
 if TYPE_CHECKING:
     from .motion import Member, Steps
 
 UNSTATED = "standard deviations of {}: none was logged"
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
-MOTION = ("vx", "vy", "speed")
+MOTION = ("vx", "vy", "speed", "vy_body")
 Origin = tuple[float, float, float]
 WEEK = 604800.0
 PERIODS = 3600.0, WEEK / 7, WEEK, 2**32 / 1000, 1024 * WEEK
@@ -120,6 +122,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     rows = rows.assign(kind=[kind.name for kind in kinds], value=scale * rows["value"] + offset)
     angle = rows["kind"].isin(ANGLES[:3])
     rows = rows.assign(value=rows["value"].mask(angle, wrap(rows["value"])), std=rows["std"] * abs(scale))
+    rows = _by_attitude(rows, summary)
     keys = ["t", "vehicle", "kind"]
     none = _nowhere(rows)
     summary.refuse("fixes at zero, which are none", rows[none])
@@ -148,6 +151,30 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
     value = rows["value"].mask(geodetic, enu.reindex(pd.MultiIndex.from_frame(rows[keys])).to_numpy())
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
+
+
+def _by_attitude(rows: Rows, summary: Summary) -> Rows:
+    """Rows with the heading h of each quaternion, R from the body to the local frame, in its place, and with body
+    velocities v of three axes without its tilt, R_z(-h) R v, by the last quaternion until then."""
+    turns = rows["kind"].isin(QUATERNION)
+    if not turns.any():
+        return rows
+    index = pd.MultiIndex.from_frame(rows[["vehicle", "t", "kind"]])
+    table = rows["value"].set_axis(index)[~index.duplicated()].unstack().reindex(columns=[*BODY, *QUATERNION])
+    unit = abs(np.linalg.norm(table[QUATERNION], axis=1) - 1.0) < QUATERNION_ROUNDING
+    table.loc[~unit, QUATERNION] = np.nan
+    rotation = to_rotation(table[QUATERNION].groupby("vehicle").ffill().to_numpy())
+    heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+    table[BODY] = turned((rotation @ table[BODY].to_numpy()[..., None])[..., 0], -heading)
+    table.loc[unit, "qw"] = heading[unit]
+    made = table.stack().reindex(index).to_numpy()
+    known = np.isfinite(made)
+    summary.refuse("numbers of quaternions that lack one, or are not of unit length", rows[turns & ~known])
+    for name in rows["vehicle"][turns].unique():
+        summary.assume("quaternions turn from the body (x forward, y left, z up) to the local frame: those of {}", name)
+    rows = rows.assign(value=np.where(known, made, rows["value"]), kind=rows["kind"].replace("qw", "heading"))
+    kept: Rows = rows[~turns | (known & rows["kind"].eq("heading"))]
+    return kept
 
 
 def _nowhere(rows: Rows) -> Bools:

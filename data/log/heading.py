@@ -68,7 +68,7 @@ class Reckoning(NamedTuple):
 
     Attributes:
         fixes: m, on two axes at least.
-        speed: m/s.
+        speed: m/s, forward, left and up.
         yaw_rate: rad/s.
         std: m, of a fix on an axis.
         walk: rad in a root of a second, by which the integral of the yaw rate wanders.
@@ -136,7 +136,8 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
 
     >>> t = np.arange(0, 60, 0.5)
     >>> circle = 2.0 * np.column_stack([np.sin(0.2 * t), -np.cos(0.2 * t)])
-    >>> way = Reckoning(Signal(t, circle), Signal(t, np.full((120, 1), 0.4)), Signal(t, np.full((120, 1), 0.2)), 1.0)
+    >>> speed, rate = np.tile([0.4, 0, 0], (120, 1)), np.full((120, 1), 0.2)
+    >>> way = Reckoning(Signal(t, circle), Signal(t, speed), Signal(t, rate), 1.0)
     >>> course, factor = heading_of_rates(way, 1.0)
     >>> course.at(np.array([50.0])).round(1), factor  # 10 rad
     (array([-2.6]), 1.0)
@@ -180,8 +181,8 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
         speed_scale_std=SCALE,
         yaw_rate_bias_std=GYRO_BIAS,
     )
-    forward, turn = step_means(speed, t) * [1.0, 0.0], step_means(rate, t)
-    rec = planar_recording(("vehicle",), t, forward[:, None], turn, np.empty((0, 2)), np.empty((0, 5)), sensors, "")
+    moves, turn = step_means(speed, t)[:, None, :2], step_means(rate, t)
+    rec = planar_recording(("vehicle",), t, moves, turn, np.empty((0, 2)), np.empty((0, 5)), sensors, "")
     step = steps_of(fixes.t - t[0], dt, len(t))
     gnss = np.full_like(rec.gnss, np.nan)
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)

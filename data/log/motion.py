@@ -24,7 +24,7 @@ from .heading import (
     step_means,
     unknown,
 )
-from .units import Rows, Summary, in_group, only, row_of
+from .units import BODY, Rows, Summary, in_group, only, row_of
 
 BETWEEN = (0.25, 0.5, 0.75)
 """Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
@@ -47,7 +47,6 @@ OTHER_RATES = "yaw rates are rad/s anticlockwise, but fixes of {} turn otherwise
 NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
 
 VELOCITIES = ("vx", "vy", "vz")
-AHEAD: Floats = np.array([1.0, 0.0, 0.0])
 
 
 class Shown(NamedTuple):
@@ -176,7 +175,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if flat and not steps.planar:
         summary.assume("heights of {} are 0: none were logged, or few", name)
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
-    measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
+    measured, turn, speed = (samples(rows, kinds, summary) for kinds in (("heading",), ("yaw_rate",), BODY))
+    speed = Signal(speed.t, np.nan_to_num(speed.value))
     still = np.zeros((len(grid), 3))
     none = np.full(len(grid), np.nan)
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
@@ -221,9 +221,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         summary.refuse("world velocities in body frames", only(rows, *VELOCITIES))
         signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
         along = _heading(measured, None, shown, derived, way, steps)
-        forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
-        moves: Floats = forward * turned(AHEAD, along.at(grid))
-        velocity: Floats = forward * AHEAD
+        velocity, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
+        moves: Floats = turned(velocity, along.at(grid))
     else:
         moved, times, heading = _in_world(name, rows, measured, shown, derived, way, steps)
         signals, rate = [times], none
@@ -253,7 +252,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2))
     wander = _wander(heading, moves, steps)
     velocity = velocity + absent[:, None]
-    climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
+    climbs = 0.0 if flat or by_fixes or rows["kind"].isin(("vz", "vz_body")).any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate, compass, moves, wander, climbs)
 
@@ -295,16 +294,16 @@ def _in_world(
         summary.refuse("speeds where a world velocity is given", speeds)
         moved = step_means(Signal(world.t, np.nan_to_num(world.value)), steps.grid)
         return moved, world, heading._replace(wanders=0.0, of_pace=np.zeros_like)
-    if len(speed.t) and (heading.at is not unknown or abs(speed.value.mean()) < STANDS):
+    if len(speed.t) and (heading.at is not unknown or np.linalg.norm(speed.value.mean(axis=0)) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
 
         def moving(at: Floats) -> Floats:
             """(G, 3) m/s, NaN where something moves, and no heading is known."""
-            pace, angle = np.interp(at, speed.t, speed.value[:, 0]), heading.at(at)
-            stands = np.isnan(angle) & ((np.abs(pace) < STANDS) | (heading.at is unknown))
-            return pace[:, None] * np.where(stands[:, None], 0.0, turned(AHEAD, angle))
+            own, angle = _between(speed, at), heading.at(at)
+            stands = np.isnan(angle) & ((np.linalg.norm(own, axis=1) < STANDS) | (heading.at is unknown))
+            return np.where(stands[:, None], 0.0, turned(own, angle))
 
         velocity = moving(at)
         kept, own = np.isfinite(velocity[:, 0]), np.isin(at, speed.t)
@@ -350,11 +349,18 @@ def _heading(
         least = min(MOVING, OF_FASTEST * fastest)
         if (moving := (pace > np.maximum(least, SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
+            if len(way.speed.t):
+                course = wrap(course - np.arctan2(*_between(way.speed, t)[:, 1::-1].T))
             bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
             shown_at = t[: len(t) * (rate is None)]
             return Course(courses, source, wanders, np.zeros_like, float(np.median(std)), shown_at, float(bends))
     return Course()
+
+
+def _between(signal: Signal, at: Floats) -> Floats:
+    """(G, C) on the straight lines between samples."""
+    return np.column_stack([np.interp(at, signal.t, column) for column in signal.value.T])
 
 
 def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:

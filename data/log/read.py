@@ -228,7 +228,7 @@ def read_log(
     deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
-    paths = [samples(group, ("x", "y"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
+    paths = [samples(group, ("x", "y", "z"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
     if not any_scale and any(len(t) for t, _ in paths):
         check_scale(paths, path.name)
     ids = _ids(rows, body, summary)

@@ -13,6 +13,10 @@ from coopoc.arrays import Bools
 DEGREE, MAX_ANGLE_RAD = float(np.pi / 180), float(2 * np.pi) + 1e-3
 
 
+BODY, QUATERNION = ["speed", "vy_body", "vz_body"], ["qx", "qy", "qz", "qw"]
+"""Velocity forward, left and up; rotation from the body to the local frame."""
+
+
 class Kind(NamedTuple):
     """What a number of this kind means.
 
@@ -38,8 +42,11 @@ KINDS = {
     **{name: Kind("odometry", name, 500.0) for name in ("vx", "vy", "vz", "speed")},
     "speed_kmh": Kind("odometry", "speed", 1800.0, 1 / 3.6),
     "speed_knots": Kind("odometry", "speed", 972.0, 1.852 / 3.6),
+    "vx_body": Kind("odometry", "speed", 500.0),
+    **{name: Kind("odometry", name, 500.0) for name in BODY[1:]},
     "yaw_rate": Kind("odometry", "yaw_rate", 35.0),
     "heading": Kind("heading", "heading", MAX_ANGLE_RAD),
+    **{name: Kind("heading", name, 1.01) for name in QUATERNION},
     "range": Kind("relative", "range"),
     "azimuth": Kind("relative", "azimuth", MAX_ANGLE_RAD),
     "bearing": Kind("relative", "bearing", MAX_ANGLE_RAD),
