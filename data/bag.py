@@ -105,7 +105,7 @@ def read_bag(
                 if topic not in topics:
                     raise unknown(f"{path.name}: topic", topic, sorted(topics))
             wanted = [c for c in reader.connections if topics[c.topic]]
-            what, fields = dict[str, str](), dict[str, list[str]]()
+            what, fields = {}, {}
             for c in wanted:
                 what[c.topic], *fields[c.topic] = READ[c.msgtype].split()
             of = _vehicles(what, truth, path.stem)

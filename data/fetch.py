@@ -186,7 +186,7 @@ def fetch(name: str) -> Path:
 def _bring(entry: Entry) -> None:
     """Download what is absent: each file from its address or the mirror's, else the archive of all; and keep what has
     the right bytes."""
-    absent, unpacked = entry.absent(), dict[str, bytes]()  # another process may have brought it meanwhile
+    absent, unpacked = entry.absent(), {}  # another process may have brought it meanwhile
     if absent and entry.address(absent[0]) == entry.archive:
         data = _downloaded(entry, entry.archive, entry.folder / ARCHIVE, entry.bytes)
         unpacked = _unpacked(entry, absent, data)

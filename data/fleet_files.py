@@ -109,7 +109,7 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
     """
     import pandas as pd
 
-    rows: list[list[str]] = []
+    rows = []
     now = ""
     try:
         for event, element in ElementTree.iterparse(path, events=("start", "end")):

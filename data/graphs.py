@@ -36,7 +36,7 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
         )
     edges, ranges, marks = graph.relative_pose, graph.ranges, ~graph.is_pose & np.isfinite(graph.position).all(axis=1)
     edge_of, names = {pair: k for k, pair in enumerate(map(tuple, edges.nodes.tolist()))}, [*graph.names]
-    parts, used = list[dict[str, Any]](), 0
+    parts, used = [], 0
     for robot, places in graph.robots.items():
         index = [edge_of.get(pair, -1) for pair in pairwise(places.tolist())]
         if -1 in index:
@@ -62,7 +62,7 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
     measured = {"range": ranges.distance, "range_std": np.sqrt(ranges.variance)}
     parts.append({"t": ranges.stamps, "vehicle": one, "partner": other, **measured})
     heading = {"heading": graph.orientation[graph.is_pose, 0], "true": 1.0}
-    for rows, more in ((marks, dict[str, Any]()), (graph.is_pose, heading)):
+    for rows, more in ((marks, {}), (graph.is_pose, heading)):
         at = {"t": graph.stamps[rows], "x": position[rows, 0], "y": position[rows, 1]}
         parts.append({"vehicle": who[rows], **at, **more})
     others = (graph.relative_point, graph.pose_prior, graph.point_prior, edges)

@@ -46,7 +46,7 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
     every, vehicle = dict[str, dict[int, list[str]]](), re.sub("(?i)_(input|gt)$", "", path.stem)
     for number, (tag, *words) in read_words(path):
         every.setdefault(tag, {})[number] = words
-    parts = list[pd.DataFrame]()
+    parts = []
     for tag, lines in every.items():
         if tag not in FORMS:
             summary.unused[f"{path.name}: lines {tag}"] += len(lines)

@@ -41,7 +41,7 @@ def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
         import torch
     except ImportError:
         raise MissingLibraryError("torch", "reading tensors", "'coopoc[learned]'") from None
-    parts = list[pd.DataFrame]()
+    parts = []
     try:
         for drive in torch.load(path, map_location="cpu", weights_only=True):
             arrays = {name: np.asarray(drive[name], dtype=float)[:, :n] for name, n in FIELDS.items()}

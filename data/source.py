@@ -41,7 +41,7 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     name = name if os.path.exists(name) else str(local(name) or name)
     if not mark:
         return name, {}
-    options: dict[str, Any] = {}
+    options = {}
     for part in query.split("&"):
         key, equals, value = part.partition("=")
         if not (key and equals and value) or key in options:

@@ -186,7 +186,7 @@ def card(name: str, drawn: Mapping[str, Task], data: Path | None = None, tasks: 
         data: folder of the real measurements, or None.
         tasks: those that are run; by default all that there are for the name, without data the simulated ones.
     """
-    chosen = dict[str, Callable[[], Row]]()
+    chosen = {}
     for task, run in runnable(name, drawn, data).items():
         if data and not tasks and task in PUBLISHED and not holds(data, task):
             print(f"coopoc: {task} is left out: no {PUBLISHED[task][0]} below {data}", file=sys.stderr)

@@ -95,7 +95,7 @@ def choices(results: Results) -> "pd.DataFrame":
 
 
 def _findings(results: Results) -> list[str]:
-    texts, each = list[str](), choices(results)
+    texts, each = [], choices(results)
     for limit in BYTE_LIMITS if len(each) else ():
         if len(within := each[each[PAYLOAD] <= limit]):
             best = within.sort_values("rt_le_m", kind="stable").iloc[0]

@@ -38,7 +38,7 @@ def cell(p: Params) -> list[Row]:
     def score(row: int) -> Floats:
         return rt_le(made.after(row).method(p["method"], start)(recording, egos), drive)
 
-    rows: list[Row] = []
+    rows = []
     for number in (rounds,) if alone else range(rounds + 1):
         at = last if alone else round(number * last / rounds)
         rows += [{"round": number, **row} for row in rows_of({"rt_le_m": score(made.kept(at))}, egos)]

@@ -172,7 +172,7 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
     from coopoc.methods.catalogue import METHODS
 
     (recording, who, drive), metric = scene.trial(p), p.get("metric", "")
-    table: list[Row] = []
+    table = []
     strange = p["method"] not in METHODS and not weights.is_trained(p["method"])
     for seed, method in methods(p):
         columns = scored(method, recording, who, drive, quantiles, metric)
@@ -198,7 +198,7 @@ def bound_rows(p: Params) -> list[Row]:
         return [{"run": 0, "ego": ego} for ego in scene.egos(p)]
     acting, rate = scene.sensors(p), min(v2x.rate or np.inf, 1 / drive.dt)
     clean = scene.recording(p, remove_outliers=True) if acting.outliers or scene.attacking(p) else None
-    rows_of_egos: list[Row] = []
+    rows_of_egos = []
     for ego in scene.egos(p):
         column = drive.index(ego)
         level = bound_rt_le(posterior_bound(drive, acting, column, v2x, past=past, recording=clean))

@@ -117,7 +117,7 @@ def cell(p: Params) -> list[Row]:
     start, block = int(until / dt), max(int(drives.block(p) / dt), 1)
     recording = thinned(drive.recording, p["landmarks"], start)
     blocks = max((len(recording.t) - start) // block, 1)
-    rows: list[Row] = []
+    rows = []
     for who in [(name,) for name in drive.ids] if len(filters) > 1 else [drive.ids]:
         method = filters[drive.ids.index(who[0]) % len(filters)]
         track = method(recording, who)

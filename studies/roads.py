@@ -113,7 +113,7 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
 def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> Row:
     """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
     vehicle, NEES of (x, y), us of a step."""
-    blocks, ratios, seconds, axis = list[float](), list[Floats](), 0.0, dict[str, float]()
+    blocks, ratios, seconds, axis = [], [], 0.0, {}
     size = min(BLOCK_SECONDS / recording.dt, (len(recording.t) - start) / MIN_BLOCKS)
     for column in recording.observers:
         squares = np.full(len(recording.t), np.nan)

@@ -72,7 +72,7 @@ def _figure(results: Results) -> "Plot | None":
 def _findings(results: Results) -> list[str]:
     """The best filter at each K, the largest first, and those alike; smoothers know later measurements and are no
     filters."""
-    texts, rows = list[str](), results.frame
+    texts, rows = [], results.frame
     for k in sorted(rows["max_neighbours"].unique(), reverse=True) if len(rows) else ():
         pairs = rows[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
         each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})

@@ -99,7 +99,7 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
     first = number("seed", seed or 0, 0, 2**29, kind=int, allowed="in 0..2^29", hint="Count worlds from 0.")
     for name in methods:
         named_method(name)
-    cards = list[dict[str, Any]]()
+    cards = []
     for name in methods:
         began, file = time.perf_counter(), card_file(name, out, seed, validation)
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
@@ -136,7 +136,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
         jobs: processes.
     """
     cells = [Cell({"seed": k}, {"seed": k}, str(k)) for k in range(seed, seed + count)]
-    rows, failed = list[Row](), dict[int, str]()
+    rows, failed = [], {}
     done = progress_bar(compute(partial(world_row, name, split), cells, jobs), name, count, unit="world", delay=2.0)
     for outcome in done:
         at = outcome.cell.settings["seed"]
@@ -252,7 +252,7 @@ def _of(value: float | None) -> str:
 
 def _table(head: str, summaries: Sequence[tuple[str, Params]], left_out: str) -> str:
     """Markdown table of summaries by name, but for one of its columns."""
-    rows = list[Row]()
+    rows = []
     for name, scored in summaries:
         columns = {
             head: name,

@@ -404,7 +404,7 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
 def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Floats]]:
     """Steps and the bound (dn, dn) of their members: forward, or for smoothing from the last step to the first, by the
     recursion of Rauch, Tung and Striebel."""
-    filtered: list[Floats] = []
+    filtered = []
     cov: Floats = np.zeros((0, 0))
     bar = progress_bar(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0)
     with bar, one_thread():

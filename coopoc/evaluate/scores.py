@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats
+from ..arrays import AnyArray
 from ..errors import InputError, shown
 from ..methods.gaps import follow, needs_fix
 from ..methods.track import Method, Track, far_off
@@ -63,7 +63,7 @@ def scored(
     >>> scored(GNSS(), observe(fleet, Sensors(), runs=3), ["a"], fleet)["rt_le_m"].shape
     (3, 1)
     """
-    seconds, parts, squares = 0.0, list[dict[str, AnyArray]](), list[Floats]()
+    seconds, parts, squares = 0.0, [], []
     there = np.isfinite(recording.velocity[0][:, [recording.ids.index(ego) for ego in egos], 0])
     has_truth = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
     for part in slabs(recording, len(egos)):

@@ -97,7 +97,7 @@ class Track:
         if self.ids:
             columns("egos", self.egos, self.ids)
         by_name = named("extras", self.extras, "Give name -> (R, T, E), {} for none.")
-        each, by_link = ("(R, T, E)", x.shape[:3]), dict[int, tuple[str, tuple[int, ...]]]()
+        each, by_link = ("(R, T, E)", x.shape[:3]), {}
         if self.neighbours is not None:
             by_link[2] = "(R, L)", self.neighbours.shape[:2]
         extras = {name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in by_name.items()}

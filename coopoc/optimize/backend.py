@@ -57,7 +57,7 @@ class Capabilities:
         >>> Capabilities().lacking(problem), Capabilities(constraints="linear").lacking(problem)
         (['a constraint on position'], [])
         """
-        kinds, losses = set[str](), set[str]()
+        kinds, losses = set(), set()
         if self.kinds is not None:
             kinds = {f.kind for f in problem.factors} - {*self.kinds}
         if self.losses is not None:

@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -111,7 +111,7 @@ def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | No
     starts: dict[str, Callable[[], Floats]] = {
         name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
     }
-    starts["odometry"], late = lambda: np.asarray(problem.x0), dict[str, Any]()
+    starts["odometry"], late = lambda: np.asarray(problem.x0), {}
     if not graph.guess and np.isfinite(graph.position).all():
         late["file"] = lambda _: (_x0(graph, problem.poses, "file"), 0)
     if problem.poses:
@@ -188,7 +188,7 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
-    d, factors = graph.dimension, list[Factor]()
+    d, factors = graph.dimension, []
     for name, kind in MEASUREMENT_KINDS.items():
         edges = getattr(graph, name)
         if not len(edges):

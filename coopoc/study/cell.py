@@ -59,7 +59,7 @@ def assignments(texts: Sequence[str]) -> Mapping[str, str]:
     >>> assignments(["runs=100"])
     {'runs': '100'}
     """
-    pairs: dict[str, str] = {}
+    pairs = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:

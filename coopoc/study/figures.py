@@ -130,7 +130,7 @@ def curves(
     models -= {"none", "trained"}
     labelled = any("label" in of for of in every)
     for panel in panels:
-        drawn: list[tuple[Where, Any]] = []
+        drawn = []
         for of in lines:
             points = {x: number(results, {**panel.where, **also, **_where(of)}) for x, also in panel.x.items()}
             drawn += [(of, ran(points))] if ran(points) else []

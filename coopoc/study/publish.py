@@ -40,7 +40,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
     """
     folder = given_path(folder)
     write(folder / "results.parquet", lambda file: results.frame.to_parquet(file, index=False))
-    missing, errors = dict[str, str](), list[Exception]()
+    missing, errors = {}, []
 
     def made(name: str, view: Callable[[Results], Any]) -> Any:
         try:

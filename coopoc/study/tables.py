@@ -177,7 +177,7 @@ class Table:
 
     def _bold(self) -> set[tuple[int, int]]:
         """(row, column) of the best numbers, as far as they are shown, and of those alike."""
-        bold = set[tuple[int, int]]()
+        bold = set()
         for group in self.ranked():
             same = [(i, j) for mean, i, j in group if mean == group[0][0] or (i, j) in self.alike]
             if len(same) <= max(2, len(group) / 2) and len(same) < len(group):  # what three and most have is none
@@ -261,7 +261,7 @@ def pivot(
         intervals=intervals,
         notes=(*gone, *lost(results, where)),
     )
-    same_as_best = list[tuple[int, int]]()
+    same_as_best = []
     for ranked in made.ranked():
         first, *others = (of[made.rows[i][: len(down)]][made.header[j]] for _, i, j in ranked)
         for (_, i, j), row in zip(ranked[1:], others, strict=True):
@@ -298,7 +298,7 @@ EQUAL_ERRORS_M = 1e-3
 def unused(results: Results, real: bool) -> list[str]:
     """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego, or on
     real data larger."""
-    rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
+    rows, texts, by = results.frame, [], ["method", "max_neighbours"]
     value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
     sent = "sent_bytes" if "sent_bytes" in rows else "sent_bytes_per_second"
     if not {*by, sent, value} <= set(rows):

@@ -255,7 +255,7 @@ def _of_vehicles(c: Check) -> list[str]:
 def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     """Of one; odometry that fails, or noise that is not as stated, where nothing else explains it."""
     name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
-    column, sentences = c.world.ids.index(name), list[str]()
+    column, sentences = c.world.ids.index(name), []
     share = c.wild[column] / max(row["fixes"] + c.wild[column], 1)
     if share > OUTLIER_SHARE and c.wild[column] > LEAST_OUTLIERS:
         sentences.append(

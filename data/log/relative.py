@@ -157,7 +157,7 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
     """Who measures whom -> by what that is off where it is for long, though an offset is taken off; and in words, with
     whom else it fits."""
     links, ids, measured = c.world.links, c.world.ids, c.world.relative[0, :, 0]
-    misfit_of = dict[tuple[str, str], tuple[float, str]]()
+    misfit_of = {}
     t, names = c.world.t - c.world.t[0], pairs(c, k, True)
     for rows in names.groupby(names).groups.values():
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]

@@ -56,7 +56,7 @@ def screen(
     >>> screen(torch.ones(2), two)[0]
     {'b': 'changes the weights by 199, at most 1.41 is accepted'}
     """
-    reasons, far = dict[str, str](), dict[str, float]()
+    reasons, far = {}, {}
     for name in sorted(answers):
         sent = answers[name]
         if sent.shape != theta.shape:

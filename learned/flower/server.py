@@ -205,8 +205,8 @@ def read(
         names: of the nodes, from their first answers on; a node cannot change its own.
         loss: the loss that an answer must hold.
     """
-    right: dict[str, Message] = {}
-    rejected: dict[str, str] = {}
+    right = {}
+    rejected = {}
     for reply in sorted(replies, key=lambda reply: reply.metadata.src_node_id):
         node = reply.metadata.src_node_id
         who = names.get(node, f"node {node}")
@@ -227,7 +227,7 @@ def read(
             rejected[who] = problem
         else:
             right[label] = reply
-    claimed, notes = _numbers(right, "num-examples"), list[str]()
+    claimed, notes = _numbers(right, "num-examples"), []
     most = int(MOST_PIECES * median(claimed.values())) if claimed else 0
     for name, pieces in claimed.items():
         if pieces > most:
@@ -270,7 +270,7 @@ def _theta(arrays: Any) -> Tensor:
 def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
     """The rounds as `federate` gives them: clients in the order of their names, and the last report of each."""
     sizes = {name: count for row in rows for name, count in row.pieces.items()}
-    names, last, history = sorted(sizes), dict.fromkeys(sizes, math.nan), list[Round]()
+    names, last, history = sorted(sizes), dict.fromkeys(sizes, math.nan), []
     for row in rows:
         last |= row.validation_loss
         size, absent = 4 * len(row.weights), [n for n in names if n not in row.training_loss and n not in row.rejected]

@@ -100,7 +100,7 @@ def fit(
         instance(field, pieces, Segments)
     began, theta, draw = time.perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
     plan, judge = schedule.plan(len(training), draw), Judge([[validation], *([] if long is None else [[long]])], model)
-    history, so_far = [Progress(0, theta[0].clone(), math.nan, float(judge(theta)))], list[Tensor]()
+    history, so_far = [Progress(0, theta[0].clone(), math.nan, float(judge(theta)))], []
     due = set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist())
     rates, draws, stopped = schedule.learning_rate * cosine(len(plan)), [generator(draw)], dict[int, str]()
     steps = descend(theta, model, training, [plan], [rates], schedule, draws, stopped)

@@ -38,7 +38,7 @@ def _next(recording: Recording, waiting: list[int], places: Floats) -> tuple[int
     """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix or sees
     two of them; else, of the one with most, those to all whose `places` (T, N, 3) m are
     finite."""
-    every: list[Ints] = []
+    every = []
     for column in waiting:
         links = recording.links.of(column)
         marks = to_landmarks(recording, links)

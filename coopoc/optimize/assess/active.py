@@ -93,7 +93,7 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     low, high = rows.value - rows.lower <= reach, rows.upper - rows.value <= reach
     equal, touched = rows.lower == rows.upper, np.flatnonzero((low | high) & (length > 0))
     multipliers, onto = np.zeros(len(length)), np.zeros(gradient.size)
-    own_columns, along, exact = list[Ints](), list[Floats](), list[Floats]()
+    own_columns, along, exact = [], [], []
     for members, columns, block in _apart(rows.matrix[touched]):
         own = touched[members]
         unit = block / length[own, None]

@@ -355,7 +355,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     Measurements that a robust loss rejects count neither in the cost nor in what is expected. Where inequalities push,
     the cost is no more than that of the truth, which all that is measured adds to.
     """
-    unknowns, notes, rejected = sparse(problem).size, list[str](), list[tuple[str, int, int, str]]()
+    unknowns, notes, rejected = sparse(problem).size, [], []
     spent, out, pushing = 0.0, 0, 0
     if not np.isfinite(truth.cost):
         return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)

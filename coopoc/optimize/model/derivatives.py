@@ -182,7 +182,7 @@ def expressions(structure: Structure) -> dict[str, Any]:
         places = [(ca.vec(centre[nodes, :].T), ca.vec(step[nodes, :].T)) for nodes in term.nodes.tolist()]
         return [white(at, number[k, :].T, moved) for k, (at, moved) in enumerate(places)]
 
-    cost, numbers, bounds = 0.0, list[Any](), list[Any]()
+    cost, numbers, bounds = 0.0, [], []
     for term in structure.factors:
         numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
         for white in each(term, numbers[-1]):
@@ -393,7 +393,7 @@ def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int,
     """Sparse Jacobian (rows, n dof), CSR; shape is n and dof."""
     from scipy.sparse import csr_array
 
-    (n, dof), data, columns, lengths = shape, list[Floats](), list[Ints](), list[Ints]()
+    (n, dof), data, columns, lengths = shape, [], [], []
     for factor, jacobians in zip(factors, linear.jacobian, strict=True):
         by_nodes = np.concatenate(jacobians, axis=2)
         own = (dof * factor.nodes[:, :, None] + np.arange(dof)).reshape(len(by_nodes), 1, -1)

@@ -64,7 +64,7 @@ class Marked:
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
     """The problem with its candidates, checked; their bounds are yet to be given."""
-    places: list[tuple[int, int]] = []
+    places = []
     for item in candidates if isinstance(candidates, Sequence) else [candidates]:
         k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 0 <= k < len(problem.factors):

@@ -11,7 +11,7 @@ from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
-from ..model.factor import Factor, Loss, taken, unchecked
+from ..model.factor import Loss, taken, unchecked
 from ..model.problem import Problem
 from ..starts.mirrors import Cost, Descend, across, movable, scaled
 from ..starts.race import QUIET_DRAWS, doubts, drawn, higher, reached_once, scattered
@@ -148,7 +148,7 @@ def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
 def softened(marked: Marked, loss: str) -> Problem:
     """The problem with a loss on its candidates (their rows are factors of their own), each of the scale of its
     group."""
-    factors = list[Factor]()
+    factors = []
     for k, factor in enumerate(marked.problem.factors):
         here = marked.factor == k
         rows, scale = marked.row[here], np.sqrt(marked.bound[marked.group[here]])

@@ -64,7 +64,7 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
     items = *problem.factors, *map(as_factor, problem.constraints)
     counts = [*(np.array(True) for _ in problem.factors), *map(bounded, problem.constraints)]
     with np.errstate(all="ignore"):
-        linear, undefined = linearise(problem.space, items, problem.movable, x), list[tuple[Factor, Ints]]()
+        linear, undefined = linearise(problem.space, items, problem.movable, x), []
     for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
         bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
         undefined += [(item, item.nodes[bad])] if bad.any() else []

@@ -67,8 +67,8 @@ def race(
         reached: (n, ambient) the end of the descent from an x0, which competes.
     """
     system, taken, arrived = sparse(problem), 0, True
-    tried = dict[str, tuple[float, Floats]]() if reached is None else {"x0": (system.cost(reached), reached)}
-    straight, late = set[str](), dict(late)
+    tried = {} if reached is None else {"x0": (system.cost(reached), reached)}
+    straight, late = set(), dict(late)
     rough, calm, minima = list[str](), list[float](), list[float]()
     mean, variance = expected(problem, system.size)
     usual = EXCESS_STDS * np.sqrt(variance)
