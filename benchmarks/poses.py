@@ -39,7 +39,7 @@ def ours(recording: co.Recording) -> Callable[[], Any]:
     """The kernel over all runs; poses (R, T, 4) of the ego."""
     method, members = co.PoseFilter(exact=False, robust=False, lasting=False), list(range(len(recording.ids)))
     begin, links = first_poses(recording, None, members), np.arange(len(recording.links))
-    return lambda: method.run_filter(recording, members, links, begin)[0][:, :, 0]
+    return lambda: method._run_filter(recording, members, links, begin)[0][:, :, 0]
 
 
 def filterpys(recording: co.Recording, run: int) -> Any:

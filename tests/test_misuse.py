@@ -264,7 +264,11 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "StarStream": (star, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
     "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "per_neighbour": 0}),
     "Message.size": (co.GNSS().message.size, {"overhead": 0, "neighbours": 3}),
-    "Recording.stretches": (SEEN.stretches, {"vehicle": 0, "shortest": 2}),
+    "Recording.stretches": (SEEN.stretches, {"vehicle": 0, "shortest": 2, "fixed": True}),
+    "Recording.columns": (SEEN.columns, {"egos": [0], "fixed": True}),
+    "Sensors.motion_noise": (NOISE.motion_noise, {"interval": 0.1}),
+    "NoiseModel.process_variance": (co.NoiseModel.nominal(NOISE).process_variance, {"recording": SEEN}),
+    "NoiseModel.fix_scale": (co.NoiseModel.nominal(NOISE).fix_scale, {"recording": SEEN}),
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (
         least_squares,
@@ -386,6 +390,16 @@ def test_solvers_refuse_arguments_of_the_wrong_kind():
     swept(co.Problem.from_window, window)
     named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
+
+
+def test_arrays_of_the_wrong_kind_are_refused():
+    """NaN is no error there: absent, not measured."""
+    swept(NOISE.velocity_std, {"velocity": np.ones((4, 3)), "floor": 0.1})
+    swept(NOISE.motion_std, {"velocity": np.ones((1, 4, 2, 3)), "interval": 0.1})
+    swept(co.NoiseModel.nominal(NOISE).relative_cov, {"relative": SEEN.relative})
+    swept(PAIR.linearise, {"x": np.eye(2, 3)})
+    for law in (co.Loss("huber", 1.0).cost, co.Loss("huber", 1.0).weight):
+        swept(law, {"square": 1.0})
 
 
 def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path):

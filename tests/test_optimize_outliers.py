@@ -59,7 +59,7 @@ def test_predictions_are_those_of_dense_algebra():
     x = np.asarray(problem.x0)
     distance, spread = predicted(mark(problem, [candidate]), np.zeros(len(candidate[1])), x)
     linear = problem.linearise(x)
-    whole = problem.jacobian(linear).toarray()
+    whole = problem.whiten(x)[1].toarray()
     size = problem.factors[0].size
     rows: Ints = (size * np.array(candidate[1])[:, None] + np.arange(size)).ravel()
     known = np.delete(whole, rows, axis=0)

@@ -62,7 +62,7 @@ def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact):
     begin[:, 0] = [*rough.gnss[0, 0, 0], 0.3]
     told = replace(NOISE, range_offset_std=0.5 * (d > 6))
     method = textbook(co.PoseFilter(kind, lasting=d > 4, exact=exact, spread=spread, assumed=told))  # type: ignore[arg-type]
-    x, cov, _ = method.run_filter(rough, members, links, begin)
+    x, cov, _ = method._run_filter(rough, members, links, begin)
     measured, noise = pose_measurements(rough, members, links), pose_noise(told, rough.dt, np.inf)
     for run in range(2 - exact):
         first = begin[run, members], spread

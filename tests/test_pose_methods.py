@@ -197,6 +197,6 @@ def test_after_a_gap_it_begins_anew():
     fleet = replace(fleet, position=fleet.position * there, velocity=fleet.velocity * there)
     seen = observed(fleet, replace(WHITE, compass=False), runs=1)
     filter_ = co.PoseFilter(begin=co.pose_start(seen))
-    error = filter_.begins(seen, [1])[:, 1, 1, 3] - np.arctan2(*fleet.velocity[90, 1, 1::-1])
+    error = filter_._begins(seen, [1])[:, 1, 1, 3] - np.arctan2(*fleet.velocity[90, 1, 1::-1])
     assert np.abs(wrap(error)) < 0.3
     assert filter_(seen, [1]).absent.sum() == 40

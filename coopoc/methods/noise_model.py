@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import TINY, Floats, Ints, check_fields, checked, instance, number, refuse, remade, texts
+from ..arrays import TINY, Floats, Ints, check_fields, checked, instance, number, plain, refuse, remade, texts
 from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..plugins import find
@@ -149,7 +149,7 @@ class NoiseModel:
                 messages that arrive.
             first: step at which the filter begins.
         """
-        velocity, links, dt = recording.velocity, recording.links, recording.dt
+        velocity, links, dt = check_recording(recording).velocity, recording.links, recording.dt
         followed = slice(None) if columns is None or inbox is not None else columns
         if self.process_std is not None:
             variance = np.square(self.process_std)[None, None, None]
@@ -180,8 +180,8 @@ class NoiseModel:
 
     def fix_scale(self, recording: Recording) -> Floats:
         """(T, N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
-        plain = self.sensors is None or not recording.fix_factor.size
-        return np.ones((1, 1, 1)) if plain else recording.fix_scale
+        scale = check_recording(recording).fix_scale
+        return np.ones((1, 1, 1)) if self.sensors is None else scale
 
     @property
     def gnss_variance(self) -> Floats:
@@ -195,6 +195,7 @@ class NoiseModel:
 
     def relative_cov(self, relative: Floats) -> Floats:
         """Covariance (..., 3, 3) m^2 of the converted relative vectors of measurements (..., 3)."""
+        relative = checked("relative", relative, "(..., 3)", (*plain(relative).shape[:-1], 3))
         if self.sensors is None:
             return np.broadcast_to(np.eye(3), (*relative.shape, 3))
         return vector_cov(relative, self.sensors.relative_std, self.sensors.min_range)

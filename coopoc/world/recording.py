@@ -15,7 +15,6 @@ from ..arrays import (
     checked,
     instance,
     last_true,
-    listed,
     number,
     plain,
     refuse,
@@ -62,12 +61,6 @@ class Body:
             shape = self.yaw_rate.shape
         radians("yaw_rate", self.yaw_rate, MAX_YAW_RATE)
         headings(self.heading)
-
-    def check(self, velocity: Floats) -> None:
-        """InputError unless every vehicle that has a velocity (R, T, N, 3) m/s has a yaw rate."""
-        rate = checked("yaw_rate", self.yaw_rate, "(R, T, N)", velocity.shape[:3])
-        allowed = "must be there with a velocity, and only there"
-        refuse("yaw_rate", rate, np.isnan(rate) != np.isnan(velocity[..., 0]), allowed, "A vehicle that stands has 0.")
 
 
 DEGREES_STD = 0.5
@@ -153,7 +146,10 @@ class Recording:
         vehicles = np.flatnonzero(~np.isin(self.links.neighbour, self.landmarks))
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
         if self.body is not None:
-            instance("body", self.body, Body).check(self.velocity)
+            rate = checked("yaw_rate", instance("body", self.body, Body).yaw_rate, "(R, T, N)", gnss.shape[:3])
+            wrong = np.isnan(rate) != np.isnan(self.velocity[..., 0])
+            allowed = "must be there with a velocity, and only there"
+            refuse("yaw_rate", rate, wrong, allowed, "A vehicle that stands has 0.")
         for name, least, stated in (("fix_factor", TINY, 1), ("motion_variance", 0.0, 0)):
             shape = gnss.shape[1:3] if plain(getattr(self, name)).size else (0,)
             values = checked(name, getattr(self, name), "(T, N) or (0,)", shape)
@@ -258,9 +254,9 @@ class Recording:
         ((0, 3),)
         """
         (col,) = columns("vehicle", [vehicle], self.ids)
-        least = number("shortest", shortest, kind=int)
+        least, every = number("shortest", shortest, kind=int), not instance("fixed", fixed, bool)
         there = np.isfinite(self.velocity[0, :, col, 0])
-        has_fix = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
+        has_fix = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | every
         firsts = [(a + int(np.argmax(has_fix[a:b])), b) for a, b in stretches(there) if has_fix[a:b].any()]
         return tuple((a, b) for a, b in firsts if b - a >= least)
 
@@ -271,7 +267,6 @@ class Recording:
 
     def observing(self, egos: Vehicles) -> list[int]:
         """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""
-        egos = listed("egos", egos, "Give [0] for the first.")
         cols = columns("egos", egos, self.ids)
         if not cols:
             raise InputError("egos", egos, "must name at least one vehicle", "Give [0] for the first.")
@@ -285,7 +280,7 @@ class Recording:
     def columns(self, egos: Vehicles, fixed: bool = True) -> list[int]:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or, if it
         must be `fixed`, without a first fix. Later ones may be missing (NaN)."""
-        cols = self.observing(egos)
+        cols, fixed = self.observing(egos), instance("fixed", fixed, bool)
         for ego, column in zip(egos, cols, strict=True):
             if np.isnan(self.velocity[:, :, column]).any():
                 hint = (

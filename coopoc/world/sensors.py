@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ..arrays import TINY, Floats, Limits, check_fields, extent, listed, number, seed_of
+from ..arrays import TINY, Floats, Limits, check_fields, checked, extent, listed, number, seed_of
 from ..errors import InputError
 from .outliers import Outliers
 
@@ -113,28 +113,31 @@ class Sensors:
         x, y, z = (float(np.sqrt(white**2 + more)) if more else white for white in self.gnss_std)
         return x, y, z
 
-    def velocity_std(self, velocity: Floats, floor: float | None = None) -> Floats:
+    def velocity_std(self, velocity: Floats, floor: float = 0.0) -> Floats:
         """Noise std (..., 3) m/s at a velocity (..., 3) m/s, at least `floor` (default 0: what acts)."""
-        size = np.abs(velocity)
+        size: Floats = np.abs(np.atleast_1d(checked("velocity", velocity)))
         if self.velocity_reading == "speed":
-            size = np.broadcast_to(np.linalg.norm(velocity, axis=-1, keepdims=True), velocity.shape)
-        std = self.velocity_std_ratio * size
-        return np.maximum(std, floor or 0.0, out=std)
+            size = np.broadcast_to(np.linalg.norm(size, axis=-1, keepdims=True), size.shape)
+        std: Floats = np.maximum(self.velocity_std_ratio * size, number("floor", floor))
+        return std
 
     def motion_noise(self, interval: float = 0.0) -> "MotionNoise":
         """Noise of a motion that a method assumes, never below `velocity_floor`; `interval` s as of MotionNoise."""
         from ..kernels.motion import MotionNoise
 
+        interval = number("interval", interval)
         ratio, of_speed = np.full(3, self.velocity_std_ratio), self.velocity_reading == "speed"
         base = np.array([0.0, 0.0, self.climb_std * interval])
-        return MotionNoise(base, ratio, float(self.velocity_floor), float(of_speed), interval)
+        return MotionNoise(base, ratio, self.velocity_floor, float(of_speed), interval)
 
-    def motion_std(self, velocity: Floats, dt: float) -> Floats:
-        """Noise std (R, T, N, 3) m that a method assumes of motions of dt s with *measured* velocities (R, T, N, 3)
-        m/s, by the pace before each."""
+    def motion_std(self, velocity: Floats, interval: float) -> Floats:
+        """Noise std (R, T, N, 3) m that a method assumes of motions of `interval` s with *measured* velocities
+        (R, T, N, 3) m/s, by the pace before each."""
         from ..kernels.motion import own_variances
 
-        return np.sqrt(own_variances(self.motion_noise(dt), velocity, dt))
+        velocity = checked("velocity", velocity, "(R, T, N, 3)", (-1, -1, -1, 3))
+        noise = self.motion_noise(interval)
+        return np.sqrt(own_variances(noise, velocity, noise.interval))
 
     def assumable(self) -> "Sensors":
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""

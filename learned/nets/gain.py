@@ -8,7 +8,7 @@ A net of your own is one class in one file. Subclass `Recurrent` and write
 
 and everything else follows: the training loss, a rollout of many nets, the method (Recording -> Track), the stream.
 Where the loss or the method differs, subclass `Gain` and write `losses(theta, batch)` and `method(name, x0)`. The truth
-of a batch is NaN where there is no truth; `error`, `has_truth` and `over_time` leave these steps out.
+of a batch is NaN where there is no truth; `squared_error` and `over_time` leave these steps out.
 Arguments of the constructor that are kept as attributes of the same name make the net again from a checkpoint.
 """
 
@@ -124,7 +124,7 @@ class Recurrent(Gain):
             arXiv 2411.05847, equation 7.
         """
         x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return over_time(error(x, batch.truth).square().sum(-1), has_truth(batch.truth))
+        return squared_error(x, batch.truth)
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
@@ -145,18 +145,15 @@ def _arguments(kind: type[Gain]) -> tuple[str, ...]:
     return tuple(inspect.signature(kind).parameters)
 
 
-def error(x: Tensor, truth: Tensor) -> Tensor:
-    """x - truth m, and 0, with a gradient of 0, where there is no truth (NaN).
+def squared_error(x: Tensor, truth: Tensor) -> Tensor:
+    """|x - truth|^2 m^2 of positions (T, ..., 3), mean over time; steps without a truth (NaN) have no part in it, and
+    no gradient.
 
-    >>> error(torch.ones(2), torch.tensor([3.0, torch.nan])).tolist()
-    [-2.0, 0.0]
+    >>> squared_error(torch.ones(2, 3), torch.tensor([[3.0, 1.0, 1.0], [torch.nan] * 3])).item()
+    4.0
     """
-    return torch.where(truth.isfinite(), x - truth, 0.0)
-
-
-def has_truth(truth: Tensor) -> Tensor:
-    """(...) whether there is a true position (..., 3)."""
-    return truth[..., 0].isfinite()
+    there = truth.isfinite()
+    return over_time(torch.where(there, x - truth, 0.0).square().sum(-1), there[..., 0])
 
 
 def over_time(values: Tensor, counted: Tensor) -> Tensor:

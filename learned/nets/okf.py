@@ -23,7 +23,7 @@ from coopoc.world.recording import Vehicles, check_recording
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core
-from .gain import Gain, error, has_truth, over_time
+from .gain import Gain, over_time, squared_error
 from .stack import flatten
 
 
@@ -121,7 +121,7 @@ class NoiseParameters(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each segment, mean over time, sum over components, m^2."""
         x, _ = scan(self.stds(theta), batch)
-        return over_time(error(x, batch.truth).square().sum(-1), has_truth(batch.truth))
+        return squared_error(x, batch.truth)
 
     def method(self, name: str, x0: Floats | None = None) -> OptimisedKF:
         """`OptimisedKF` with these parameters."""

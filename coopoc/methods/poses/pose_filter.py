@@ -150,16 +150,16 @@ class PoseFilter:
                 )
         received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
-            begin = self.begins(recording, columns)
-            alone = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
+            begin = self._begins(recording, columns)
+            alone = [self._run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
             x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*alone, strict=True))[:2])
             theirs = _seen(recording, columns, x, [])
         else:
             members = fleet_members(recording)
-            begin = self.begins(recording, members)
+            begin = self._begins(recording, members)
             own = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
             in_time = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
-            x, cov, _ = self.run_filter(recording, members, own, begin, in_time[:, own])
+            x, cov, _ = self._run_filter(recording, members, own, begin, in_time[:, own])
             theirs = _seen(recording, columns, x, members)
             x, cov = (values[:, :, [members.index(column) for column in columns]] for values in (x, cov))
         if self.unit == "fleet" and self.fusion == "joint":
@@ -191,7 +191,7 @@ class PoseFilter:
         )
         return noted(track)
 
-    def begins(self, recording: Recording, members: Sequence[int]) -> Floats:
+    def _begins(self, recording: Recording, members: Sequence[int]) -> Floats:
         """Poses (R, S, N, 4) at the first step, and where members begin after a gap: NaN where a fix and a compass are,
         else those of `pose_start`; in a fleet NaN where it finds none."""
         there, every = present(recording), [first_poses(recording, self.begin, members)]
@@ -230,9 +230,9 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         radians("headings of begin", first[3:])
-        return PoseStream(*self.settings(self.assumed, dt), first, self._spread, dt)
+        return PoseStream(*self._settings(self.assumed, dt), first, self._spread, dt)
 
-    def run_filter(
+    def _run_filter(
         self,
         recording: Recording,
         members: Sequence[int],
@@ -257,13 +257,13 @@ class PoseFilter:
         sensors, spread = self.assumed or recording.sensors, self._spread
         if self.spread is None and np.isfinite(recording.gnss[:, :, members]).any():
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
-        noise, options = self.settings(sensors, recording.dt)
+        noise, options = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         return run_filter(measured, noise, first, spread, options, *memory)
 
-    def settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
+    def _settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
         """What it assumes, and its options, as the kernel takes them."""
         from ...kernels.poses.ekf import PoseOptions
 

@@ -66,7 +66,7 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
         spread = [2 * max(std, noise.range_std) for std in noise.fix_std]  # of one fix or one landmark, m
         own = replace(filter_, spread=(*spread, turn))
         copies = recording.of_runs(np.zeros(len(poses), int))
-        x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
+        x, cov, cost = own._run_filter(copies, [column], links, tried, landmark=landmarks)
         return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, column, poses[:, 3], noise)
 
     for turn in (HEADING_STEP / 2, 2 * HEADING_STEP / HEADINGS):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..model.factor import as_factor, bounded, stacked
-from ..model.problem import Problem
+from ..model.problem import Problem, linearised
 
 ACTIVE_STEP = 5e-7
 """m or rad, a step this long reaches the bound: the constraint is active."""
@@ -72,13 +72,13 @@ def constraint_rows(problem: Problem, x: Floats) -> Rows:
     """The constraints of a problem at x (n, ambient)."""
     items = problem.constraints
     part = problem.replace_unchecked(factors=tuple(map(as_factor, items)))
-    linear, finite = part.linearise(x), np.concatenate([bounded(item).ravel() for item in items])
+    (linear, J), finite = linearised(part, x), np.concatenate([bounded(item).ravel() for item in items])
     value, lower, upper = (
         np.concatenate([side.ravel() for side in sides])[finite]
         for sides in (linear.residual, [item.lower for item in items], [item.upper for item in items])
     )
     origin = [np.insert(np.argwhere(bounded(item)), 0, k, axis=1) for k, item in enumerate(items)]
-    return Rows(value, lower, upper, part.jacobian(linear)[finite], np.concatenate(origin))
+    return Rows(value, lower, upper, J[finite], np.concatenate(origin))
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:

@@ -13,7 +13,7 @@ from ..algebra.cholesky import cholesky_of, columns_solved, with_still
 from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, unchecked
-from ..model.problem import Problem, several
+from ..model.problem import Problem, linearised, several
 from .active import Active, active_at
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     """
     if not problem.constraints:
         return _unconstrained(problem, sparse(problem), x, covariance)
-    linear = problem.linearise(x)
-    J, shape = problem.jacobian(linear), (len(x), problem.space.dof)
+    (linear, J), shape = linearised(problem, x), problem.movable.shape
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
     active = active_at(problem, x, gradient.reshape(shape))
     size = float(np.linalg.norm(gradient + active.rows.matrix.T @ active.multipliers))
@@ -91,7 +90,7 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     try:
         cov, dx, sound = _marginals(with_still(J.T @ J, still), gradient, shape, active)
         if (stated := as_stated(problem)) is not problem:
-            J_stated = stated.jacobian(stated.linearise(x))
+            J_stated = linearised(stated, x)[1]
             cov = _marginals(with_still(J_stated.T @ J_stated, still), gradient, shape, active)[0]
     except np.linalg.LinAlgError:
         sound = False

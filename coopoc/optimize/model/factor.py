@@ -69,13 +69,13 @@ class Loss:
         """True if the loss adds no minima to those of least squares."""
         return self.name == "huber"
 
-    def cost(self, square: Floats) -> Floats:
+    def cost(self, square: npt.ArrayLike) -> Floats:
         """rho(s)."""
-        return np.asarray(LOSSES[self.name][0](square, self.scale, np))
+        return np.asarray(LOSSES[self.name][0](checked("square", square), self.scale, np))
 
-    def weight(self, square: Floats) -> Floats:
+    def weight(self, square: npt.ArrayLike) -> Floats:
         """rho'(s), in [0, 1]."""
-        return LOSSES[self.name][1](square, self.scale)
+        return LOSSES[self.name][1](checked("square", square), self.scale)
 
 
 @dataclass(frozen=True, eq=False)

@@ -213,46 +213,21 @@ class Problem:
                 changed.__dict__[name] = kept[name]
         return changed
 
-    def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints]) -> "Problem":
-        """The problem of some nodes, from x.
-
-        Args:
-            used: (n,) which nodes.
-            x: (n, ambient).
-            rows: of each factor, among the nodes that are used.
-        """
-        number = np.cumsum(used) - 1
-        kept = [taken(factor, own) for factor, own in zip(self.factors, rows, strict=True) if len(own)]
-        changes = {
-            name: tuple(number[[k for k in getattr(self, name) if used[k]]].tolist()) for name in ("poses", "fixed")
-        }
-        changes["names"] = tuple(compress(self.names, used))
-        changes["factors"] = tuple(unchecked(factor, nodes=number[factor.nodes]) for factor in kept)
-        return self.replace_unchecked(**changes, x0=frozen(x[used]), shown=0)
-
-    def rows_among(self, used: Bools) -> list[Ints]:
-        """Of each factor, the rows whose nodes are all used (n,)."""
-        return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in self.factors]
-
-    def linearise(self, x: Floats) -> Linear:
+    def linearise(self, x: npt.ArrayLike) -> Linear:
         """Whitened residuals and derivatives at x (n, ambient)."""
-        return linearise(self.space, self.factors, self.movable, x)
+        return linearise(self.space, self.factors, self.movable, self._at(x))
 
     def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
         """Residual r (rows,) and sparse Jacobian J (rows, n dof) at x (n, ambient): cost = 1/2 r.r.
 
         A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
         """
-        linear = self.linearise(self._at(x))
-        return stacked(r.ravel() for r in linear.residual), self.jacobian(linear)
-
-    def jacobian(self, linear: Linear) -> Any:
-        """Sparse Jacobian (rows, n dof) of `linearise`, CSR."""
-        return sparse_jacobian(linear, self.factors, (len(self.names), self.space.dof))
+        linear, J = linearised(self, self._at(x))
+        return stacked(r.ravel() for r in linear.residual), J
 
     def cost(self, x: npt.ArrayLike) -> float:
         """1/2 sum of rho at x (n, ambient)."""
-        return self.linearise(self._at(x)).cost
+        return self.linearise(x).cost
 
     def _at(self, x: npt.ArrayLike) -> Floats:
         return points(self.space, len(self.names), "x", x)
@@ -364,6 +339,36 @@ def no_such_node(
     """The error for a node that is neither a name nor an index."""
     listed_names = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     return InputError("node", shown(node), f"must be one of {listed_names}", suggestion(node, names, hint))
+
+
+def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:
+    """`Problem.linearise` at x (n, ambient), which need not be checked, and the sparse Jacobian (rows, n dof), CSR."""
+    linear = linearise(problem.space, problem.factors, problem.movable, x)
+    return linear, sparse_jacobian(linear, problem.factors, problem.movable.shape)
+
+
+def rows_among(problem: Problem, used: Bools) -> list[Ints]:
+    """Of each factor, the rows whose nodes are all used (n,)."""
+    return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in problem.factors]
+
+
+def restricted(problem: Problem, used: Bools, x: Floats, rows: Sequence[Ints]) -> Problem:
+    """The problem of some nodes, from x.
+
+    Args:
+        problem: of all.
+        used: (n,) which nodes.
+        x: (n, ambient).
+        rows: of each factor, among the nodes that are used.
+    """
+    number = np.cumsum(used) - 1
+    kept = [taken(factor, own) for factor, own in zip(problem.factors, rows, strict=True) if len(own)]
+    changes = {
+        name: tuple(number[[k for k in getattr(problem, name) if used[k]]].tolist()) for name in ("poses", "fixed")
+    }
+    changes["names"] = tuple(compress(problem.names, used))
+    changes["factors"] = tuple(unchecked(factor, nodes=number[factor.nodes]) for factor in kept)
+    return problem.replace_unchecked(**changes, x0=frozen(x[used]), shown=0)
 
 
 def points(space: Space, n: int, field: str, x: npt.ArrayLike) -> Floats:

@@ -11,7 +11,7 @@ from ..algebra.sparse import pairs_of, sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.derivatives import linearise
 from ..model.factor import taken
-from ..model.problem import Problem
+from ..model.problem import Problem, restricted, rows_among
 from ..model.space import carried
 from ..starts.graph_starts import parts
 from ..starts.initial import initial_guess
@@ -208,8 +208,8 @@ class Decided:
         """The placement of a pair with which most of its candidates (groups of relative poses) agree, and how many
         agree on the best other one."""
         problem, marked, used = self.problem, self.marked, np.isin(body, bodies)
-        rows = problem.rows_among(used)
-        part = pinned(problem, body[body == bodies[0]]).restricted(used, self.x, rows)
+        rows = rows_among(problem, used)
+        part = restricted(pinned(problem, body[body == bodies[0]]), used, self.x, rows)
         number, space, tried = np.cumsum([len(own) > 0 for own in rows]) - 1, problem.space, list[Placement]()
         kept = np.flatnonzero([r in rows[k] for k, r in zip(marked.factor, marked.row, strict=True)])
         rank = [np.searchsorted(rows[k], r) for k, r in zip(marked.factor[kept], marked.row[kept], strict=True)]

@@ -12,7 +12,7 @@ from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked
-from ..model.problem import Problem
+from ..model.problem import Problem, restricted, rows_among
 from ..model.space import Space, carried, exp, log, nearest_rotation
 
 Roots = Iterable[tuple[int, Floats, Floats]]
@@ -352,11 +352,11 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
 def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Problem, Bools]:
     """The problem from x (n, ambient) of the nodes that are `free` (n,) with their neighbours among the `used`, which
     are fixed, and which nodes it has."""
-    rows = [k[free[f.nodes[k]].any(axis=1)] for f, k in zip(problem.factors, problem.rows_among(used), strict=True)]
+    rows = [k[free[f.nodes[k]].any(axis=1)] for f, k in zip(problem.factors, rows_among(problem, used), strict=True)]
     kept = free.copy()
     for f, own in zip(problem.factors, rows, strict=True):
         kept[f.nodes[own]] = True
-    part = problem.restricted(kept, x, rows)
+    part = restricted(problem, kept, x, rows)
     still = np.flatnonzero((~free)[kept]).tolist()
     return part.replace_unchecked(fixed=tuple(sorted({*part.fixed, *still}))), kept
 
