@@ -211,12 +211,15 @@ def load_method(name_or_path: Path | str, net: str = "") -> Method:
 
 
 def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
-    """The vehicles of a fleet as clients, with the noise, the split and the start of the job; of measured drives with
+    """The vehicles of a fleet that train a job as clients, with its noise, split and start; of measured drives with
     what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
+    cut: dict[str, Any] = {"start": setting.start, "piece": recipe.piece, "split": recipe.split}
     if isinstance(fleet, MeasuredDrives):
-        return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
-    return clients(fleet, sensors(job), seed=setting.seed, start=setting.start, piece=recipe.piece, split=recipe.split)
+        every = measured_clients(fleet, **cut)
+    else:
+        every = clients(fleet, sensors(job), seed=setting.seed, **cut)
+    return every if job.client is None else (every[job.client - 1],)
 
 
 def untrained(job: Job) -> Gain:

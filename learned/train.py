@@ -116,14 +116,14 @@ def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> 
 
 def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
     """The checkpoint of a job, trained now."""
-    data = _own(job, job_clients(job, fleet))
+    data = job_clients(job, fleet)
     made = TRAINERS[job.recipe.kind](job, data, f"train {job.name}" if progress else None)
     return replace(made, card=_card(job, fleet, data) | dict(made.card))
 
 
 def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
     """Rms error on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
-    data = _own(job, job_clients(job, fleet))
+    data = job_clients(job, fleet)
     training, validation = (_joined(data, part) for part in ("training", "validation"))
     motions = training.truth.diff(dim=1) - training.dt * training.velocity[:, 1:]
     process, gnss = (
@@ -159,11 +159,6 @@ def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
         "training_pieces": [len(c.training) for c in data],
         "validation_pieces": [len(c.validation) for c in data],
     }
-
-
-def _own(job: Job, everyone: Sequence[Client]) -> Sequence[Client]:
-    """The clients that train a job."""
-    return everyone if job.client is None else [everyone[job.client - 1]]
 
 
 def _joined(data: Sequence[Client], part: str) -> Segments:

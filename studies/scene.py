@@ -108,10 +108,9 @@ def _there(data: str) -> Bools:
     log = _log(data)
     if log is None:
         return fleet(data).present
-    moving = np.isfinite(log.recording.velocity[0, :, :, 0])
-    started = np.maximum.accumulate(np.isfinite(log.recording.gnss[0, :, :, 0]), axis=0)
-    there = moving & started
-    standing = (np.nan_to_num(log.recording.velocity[0]) == 0).all(axis=(0, 2))
+    velocity, started = log.recording.velocity[0], np.isfinite(log.recording.gnss[0, :, :, 0])
+    there: Bools = np.isfinite(velocity[..., 0]) & np.maximum.accumulate(started, axis=0)
+    standing = (np.nan_to_num(velocity) == 0).all(axis=(0, 2))
     if not standing.all():
         there &= ~standing  # a road-side unit knows where it is
     return there if log.truth is None else there & log.truth.present

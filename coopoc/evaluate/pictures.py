@@ -199,9 +199,7 @@ def ellipses(ax: "Axes", center: Floats, covariance: Floats, color: str, label: 
     ax.autoscale_view()
 
 
-def pairs(
-    ax: "Axes", first: Floats, second: Floats, color: str = PALE, label: str | None = None, width: float = 0.9
-) -> None:
+def pairs(ax: "Axes", first: Floats, second: Floats, color: str, label: str | None = None, width: float = 0.9) -> None:
     """Lines between points (n, 2) and points (n, 2) m."""
     from matplotlib.collections import LineCollection
 

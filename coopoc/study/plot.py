@@ -143,11 +143,11 @@ def plain_log(axis: Axis) -> None:
         low, high = axis.get_view_interval()
         return float(high / low)
 
-    def decade(value: float, _: int | None = None) -> str:
+    def decade(value: float, _: int) -> str:
         whole = abs(np.log10(value) % 1.0 - 0.5) > 0.499
         return f"{value:g}" if whole or spans() < 1e3 else ""
 
-    def between(value: float, _: int | None = None) -> str:
+    def between(value: float, _: int) -> str:
         return f"{value:g}" if spans() < 5 else ""
 
     axis.set_major_formatter(FuncFormatter(decade))
