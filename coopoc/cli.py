@@ -232,10 +232,7 @@ def _settings(name: str) -> str:
 
 
 def _help(commands: Mapping[str, Command], prog: str) -> str:
-    order = [
-        *(name for name in OWN_COMMANDS if name in commands),
-        *(name for name in commands if name not in OWN_COMMANDS),
-    ]
+    order = sorted(commands, key=lambda name: name not in OWN_COMMANDS)
     lines = "\n".join(f"  {name:<10} {_summary(commands[name])}" for name in order)
     return _ABOUT.format(commands=lines) if prog == "coopoc" else f"usage: {prog} COMMAND [options]\n\n{lines}"
 

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -141,9 +141,6 @@ def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | Non
     _train(job, fleet, out, worst, line is not None)
 
 
-Trainer = Callable[[Job, Sequence[Client], str | None], Checkpoint]
-
-
 def _made(path: Path, key: str) -> bool:
     return path.is_file() and read_card(path).get("key") == key
 
@@ -186,4 +183,4 @@ def _okf(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
     return Checkpoint(*fit_okf(training, validation, job.recipe.schedule.epochs, stage))
 
 
-TRAINERS: dict[str, Trainer] = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}
+TRAINERS = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

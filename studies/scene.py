@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 Start = Literal["gnss", "true"]
 CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "kernels", "optimize", "evaluate", "learned", "data"))
 """The packages whose code makes the numbers of a cell, beside the cell's own."""
-DRAWN: Params = {"data": "town10", "egos": "auto", "seed": 0}
-WEIGHTS: Params = {"clients": "town10-clients", "weights": "runs/weights"}
-SOLO: Params = {"velocity_reading": "axis", "start": "gnss"}
-TOWN: Params = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0}
+DRAWN = {"data": "town10", "egos": "auto", "seed": 0}
+WEIGHTS = {"clients": "town10-clients", "weights": "runs/weights"}
+SOLO = {"velocity_reading": "axis", "start": "gnss"}
+TOWN = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0}
 """Settings that studies share: draws; training; filters without neighbours; draws of scenario 2 with neighbours."""
 
 

@@ -318,7 +318,7 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     ]
 
 
-def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool = False) -> Priors:
+def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool) -> Priors:
     """The method's own, and if they are the usual ones those of real roads where measurements are real; none where no
     noise is stated that an innovation could exceed."""
     priors, sensors = method.priors, noise_model.sensors

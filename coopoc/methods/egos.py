@@ -130,7 +130,7 @@ def measurements(recording: Recording, ego: int, inbox: Inbox, broadcast: Floats
     )
 
 
-def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, inbox: Inbox | None = None) -> Assumptions:
+def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, inbox: Inbox | None) -> Assumptions:
     """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity.
 
     Args:

@@ -26,7 +26,7 @@ _FIELDS = {
 }
 
 
-def publish(study: Study, results: Results, folder: str | Path, progress: bool = True) -> None:
+def publish(study: Study, results: Results, folder: str | Path, progress: bool) -> None:
     """Write results.parquet, tables/*.{md,csv,tex,html}, figures/*.{pdf,png,svg} and views.json into a folder.
 
     Views of an earlier run that this one does not make are removed. A view that cannot be made is named with its

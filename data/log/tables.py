@@ -37,7 +37,7 @@ OF_LOGS = (
 """Columns that no table of drives has."""
 
 
-def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
+def is_log_table(path: Path, columns: Mapping[str, str] | None) -> bool:
     """Whether a table has a column that only a log has, by its header or by our names in `columns`; or one
     without an id that lacks heights or has speeds, as no table of drives does."""
     in_file, ours = {name.lower() for name in headers(path)}, set(columns or ())

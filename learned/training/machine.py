@@ -11,7 +11,7 @@ from coopoc.errors import InputError, shown
 from coopoc.workers import progress_bar
 
 Item = TypeVar("Item")
-LINE: ContextVar[int] = ContextVar("line", default=0)
+LINE = ContextVar("line", default=0)
 """Of the terminal, for bars: processes side by side do not draw over each other."""
 
 
