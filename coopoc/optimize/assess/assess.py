@@ -248,7 +248,7 @@ def _evened(J: Any) -> Any:
     from scipy.sparse import diags_array
 
     largest = abs(J).max(axis=1).toarray().ravel()
-    return diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J
+    return diags_array(1.0 / np.maximum(largest, 1e-300)) @ J
 
 
 def _null_rows(J: Any, length: Floats) -> Floats:

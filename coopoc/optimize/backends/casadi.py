@@ -104,7 +104,7 @@ def _exponential(step: Floats, dimension: int) -> Floats:
         return step
     w = step[:, dimension:]
     half = 0.5 * np.linalg.norm(w, axis=-1, keepdims=True)
-    ratio = np.where(half > 1e-9, np.arctan(half) / np.where(half > 1e-9, half, 1.0), 1.0)
+    ratio = np.where(half > 1e-9, np.arctan(half) / np.maximum(half, 1e-9), 1.0)
     return np.concatenate([step[:, :dimension], ratio * w], axis=-1)
 
 

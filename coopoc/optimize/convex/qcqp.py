@@ -76,7 +76,7 @@ class Quadratic:
         at = position - self.origin
         gap = at[self.edges[:, 0]] - at[self.edges[:, 1]]
         length = np.linalg.norm(gap, axis=1, keepdims=True)
-        unit = np.where(length > 0, gap / np.where(length > 0, length, 1.0), np.eye(self.dimension)[0])
+        unit = np.where(length > 0, gap / np.maximum(length, 1e-300), np.eye(self.dimension)[0])
         frame = np.eye(self.columns)[: self.columns * self.framed]
         turned = np.swapaxes(rotation[self.poses], 1, 2).reshape(-1, self.dimension)
         return np.concatenate([frame, *(part.reshape(-1, self.columns) for part in (turned, unit, at[self.nodes]))])
@@ -107,7 +107,7 @@ class Quadratic:
         s = X[self.sphere]
         length = np.sqrt(np.square(s).sum(axis=(1, 2), keepdims=True))
         even = np.sqrt(1.0 / max(s[:1].size, 1))
-        out[self.sphere] = np.where(length > 1e-12, s / np.where(length > 1e-12, length, 1.0), even)
+        out[self.sphere] = np.where(length > 1e-12, s / np.maximum(length, 1e-12), even)
         return out
 
 
