@@ -199,10 +199,10 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
             _check_noise(graph, edges.nodes, np.linalg.eigvalsh(edges.covariance)[:, 0])
             factors.append(Factor(kind, edges.nodes, z, cov=edges.covariance))
             continue
-        variance = [position_variance(edges.covariance, d)]
+        variance = [position_variance(edges, d)]
         if turns:
             kind = f"{kind}_chordal"
-            variance.append(rotation_variance(edges.covariance, d))
+            variance.append(rotation_variance(edges, d))
         _check_noise(graph, edges.nodes, np.min(variance, axis=0))
         std = np.sqrt(variance).repeat([d, d * d][: len(variance)], axis=0).T
         factors.append(Factor(kind, edges.nodes, z, std=std, twice=turns and d == 2))

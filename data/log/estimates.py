@@ -82,7 +82,8 @@ def factors(
     if len(y) < MIN_SAMPLES:
         return none
     if groups is not None:
-        all_of = _centred(all_of, groups)
+        frame = pd.DataFrame(all_of)
+        all_of = (frame - frame.groupby(groups).transform("mean")).to_numpy()
     y, x, both = all_of[:, 0], all_of[:, 1 : k + 1], all_of[:, None, : k + 1]
     products = (all_of[:, k + 1 :, None].conj() * both).real
 
@@ -121,12 +122,6 @@ def lasting(parts: Floats) -> Floats:
     correlation = ((count * next_to + 1.0) / (count - 4.0)).clip(0.0, 0.95)
     error: Floats = few * np.sqrt(square * (1.0 + correlation) / (1.0 - correlation))
     return error
-
-
-def _centred(values: AnyArray, groups: Ints) -> AnyArray:
-    """Values (M, k) less the means of their groups (M,)."""
-    frame = pd.DataFrame(values)
-    return (frame - frame.groupby(groups).transform("mean")).to_numpy()
 
 
 def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:

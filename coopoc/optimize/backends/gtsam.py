@@ -157,11 +157,6 @@ def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     return [*chord, *_between("BetweenFactor", d, factor.z, root)]
 
 
-def _relative_log(factor: Factor, W: Floats, d: int) -> Form:
-    """GTSAM's errors in space are those of the rotation first."""
-    return _between("BetweenFactor", d, factor.z, W if d == 2 else np.roll(W, -d, axis=2))
-
-
 def _chord(W: Floats, z: Floats, d: int) -> Form:
     """GTSAM's T_j - T_i Z is R_i times our residual, column by column: each must have one std and no correlation.
 
@@ -204,7 +199,9 @@ FORMS = {
     "body_spherical": _bearing,
     "relative_position": lambda factor, W, d: _chord(W, Space(d, has_rotation=True).join(factor.z), d),
     "relative_pose": _relative_pose,
-    "relative_pose_log": _relative_log,
+    "relative_pose_log": lambda factor, W, d: _between(  # whose errors in space are those of the rotation first
+        "BetweenFactor", d, factor.z, W if d == 2 else np.roll(W, -d, axis=2)
+    ),
     "relative_pose_chordal": lambda factor, W, d: _chord(W, factor.z, d),
     "pose": _pose_prior,
 }

@@ -113,7 +113,7 @@ class Problem:
             if not isinstance(item, Factor | Constraint):
                 hint = "Add measurements with Problem.add, constraints with Problem.constrain."
                 raise InputError("factors, constraints", shown(item), "must be Factors and Constraints", hint)
-            check_item(item, self.names, self._turning, self.dimension)
+            self._check(item)
         if self.x0 is not None:
             self.__dict__["x0"] = frozen(points(self.space, len(self.names), "x0", self.x0))
         if self.fixed and self.x0 is None:
@@ -182,7 +182,7 @@ class Problem:
             cov=cov,
         )
         # it alone is checked: what was checked and found before is kept
-        check_item(factor, self.names, self._turning, self.dimension)
+        self._check(factor)
         return self.replace_unchecked(factors=(*self.factors, factor))
 
     def constrain(
@@ -204,6 +204,23 @@ class Problem:
         low, high = (limit if limit.ndim else np.broadcast_to(limit, shape) for limit in limits)
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
+
+    def _check(self, item: Factor | Constraint) -> None:
+        """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
+        measurement, nodes = item.measurement, item.nodes
+        if len(beyond := nodes[(nodes < 0) | (nodes >= len(self.names))]):
+            raise no_such_node(int(beyond[0]), self.names)
+        if item.dimension not in (None, self.dimension):
+            hint = f"Make it with Problem(names, dimension={item.dimension})." if measurement.plane else "Leave it out."
+            raise InputError(
+                f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {self.dimension}", hint
+            )
+        observers = {"body": nodes[:, :1], "relative": nodes}.get(measurement.frame, nodes[:, :0])
+        if lacking := sorted(set(observers.ravel().tolist()) - self._turning):
+            allowed = "must be a pose: the measurement is in its body frame"
+            raise InputError(
+                f"nodes of {item.kind}", self.names[lacking[0]], allowed, "Name it in Problem(names, poses=[...])."
+            )
 
     def replace_unchecked(self, **changes: Any) -> "Problem":
         """The problem with changes that come from checked parts and need not be checked again."""
@@ -309,20 +326,6 @@ def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
     """z (count, size) from a number, a row or rows."""
     values = checked(f"z of {kind}", z)
     return values.reshape(count, -1) if values.ndim < 2 and values.size % count == 0 else values
-
-
-def check_item(item: Factor | Constraint, names: Sequence[str], poses: frozenset[int], dimension: int) -> None:
-    """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
-    measurement, nodes = item.measurement, item.nodes
-    if len(beyond := nodes[(nodes < 0) | (nodes >= len(names))]):
-        raise no_such_node(int(beyond[0]), names)
-    if item.dimension not in (None, dimension):
-        hint = f"Make it with Problem(names, dimension={item.dimension})." if measurement.plane else "Leave it out."
-        raise InputError(f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {dimension}", hint)
-    observers = {"body": nodes[:, :1], "relative": nodes}.get(measurement.frame, nodes[:, :0])
-    if lacking := sorted(set(observers.ravel().tolist()) - poses):
-        allowed = "must be a pose: the measurement is in its body frame"
-        raise InputError(f"nodes of {item.kind}", names[lacking[0]], allowed, "Name it in Problem(names, poses=[...]).")
 
 
 def index_of(node: Any, index_of_name: Mapping[str, int], names: Sequence[str]) -> int:

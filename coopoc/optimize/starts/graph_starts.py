@@ -7,7 +7,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from ...formats.graph import Graph
+from ...formats.graph import Graph, PointEdges, PoseEdges
 from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
@@ -137,7 +137,7 @@ def tree(graph: Graph) -> Floats:
     edges, roots, d = graph.relative_pose, _roots(graph), graph.dimension
     position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
     held = [root for root, _, _ in roots]
-    (i, j), variance = edges.nodes.T, rotation_variance(edges.covariance, d)
+    (i, j), variance = edges.nodes.T, rotation_variance(edges, d)
     if len(edges) and d == 3:
         rotation = relaxed(graph, rotation, held)
     elif len(edges):  # angles add, so that one solve is exact
@@ -146,7 +146,7 @@ def tree(graph: Graph) -> Floats:
     space, kinds = Space(d, has_rotation=True), (edges, graph.relative_point)
     at = space.position(with_points(graph, position, rotation, reached))
     (i, j), moved = np.concatenate([each.nodes for each in kinds]).T, np.concatenate([each.position for each in kinds])
-    variance = np.concatenate([position_variance(each.covariance, d) for each in kinds])
+    variance = np.concatenate([position_variance(each, d) for each in kinds])
     places, _ = averaging(np.stack([i, j], axis=1), variance, len(at), held)
     return space.join(at + places(at[j] - at[i] - (rotation[i] @ moved[..., None])[..., 0]), rotation)
 
@@ -165,7 +165,7 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
     from scipy.sparse import bsr_array, eye_array
 
     edges, (n, d, _) = graph.relative_pose, rotation.shape
-    weight = 1.0 / np.sqrt(rotation_variance(edges.covariance, d))
+    weight = 1.0 / np.sqrt(rotation_variance(edges, d))
     back, ones = -np.swapaxes(edges.rotation, 1, 2), np.broadcast_to(np.eye(d), edges.rotation.shape)
     blocks = weight[:, None, None, None] * np.stack([back, ones], axis=1)
     gaps = bsr_array(
@@ -370,12 +370,12 @@ def _stages(graph: Graph) -> int:
     return max(min(longest // STAGE, max(STAGES, int(drifting))), 1)
 
 
-def position_variance(covariance: Floats, d: int) -> Floats:
+def position_variance(edges: PoseEdges | PointEdges, d: int) -> Floats:
     """(M,) mean variance of the position."""
-    return np.asarray(np.einsum("mii->m", covariance[:, :d, :d]) / d)
+    return np.asarray(np.einsum("mii->m", edges.covariance[:, :d, :d]) / d)
 
 
-def rotation_variance(covariance: Floats, d: int) -> Floats:
+def rotation_variance(edges: PoseEdges, d: int) -> Floats:
     """(M,) of an entry of the rotation, as the chordal objective has it."""
-    turn = np.einsum("mii->m", covariance[:, d:, d:])
+    turn = np.einsum("mii->m", edges.covariance[:, d:, d:])
     return np.asarray(turn if d == 2 else 2.0 * turn / 3.0)

@@ -37,7 +37,7 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     if not len(edges):
         return
     (i, j), turned, at = edges.nodes.T, space.rotation(x), space.position(x)
-    weight = 1.0 / rotation_variance(edges.covariance, space.dimension)[:, None]
+    weight = 1.0 / rotation_variance(edges, space.dimension)[:, None]
     error = weight * log(turned[j] @ np.swapaxes(turned[i] @ edges.rotation, 1, 2)) * np.sign(j - i)[:, None]
     pairs, of = np.unique(np.sort(edges.nodes, axis=1), axis=0, return_inverse=True)
     sums = np.zeros((len(pairs), 1 + space.angles))
@@ -56,7 +56,7 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     value, first = np.unique(adds.round(6), return_index=True)  # the same of all along a cycle
     chosen = first[value <= most].tolist()
     if chosen:
-        places, _ = averaging(edges.nodes, position_variance(edges.covariance, space.dimension), n)
+        places, _ = averaging(edges.nodes, position_variance(edges, space.dimension), n)
     for k in chosen:
         bent = error.copy()
         bent[k] -= 2.0 * np.pi * left[k] / max(size[k], BRIDGE)
