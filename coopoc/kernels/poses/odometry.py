@@ -3,11 +3,15 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from ...arrays import Floats
 from ..compiling.compile import part
+from ..compiling.vectors import LANES
 from ..gate import INITIAL_LOCKOUT
 from ..motion import MotionNoise, keep_pace, process_variance
-from .scalar_update import HEADING, OFFSET, Poses, Three
+from ..odometry_fault import PACES, SIZE, correct, new_state
+from .scalar_update import HEADING, OFFSET, ROWS, Poses, Three
 
 UNKNOWN_HEADING_RAD2 = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
@@ -41,12 +45,22 @@ class PoseNoise(NamedTuple):
     gate: float
 
 
+def new_poses(members: int, d: int, noise: PoseNoise, dt: float) -> Poses:
+    """Room for members of d numbers each; where a gate is open, their odometry is believed."""
+    size = -(-members * d // LANES) * LANES
+    (x, linear, prior_x, hits), (cov, prior_cov) = np.zeros((4, size)), np.zeros((2, size, size))
+    columns, gains = np.zeros((2, ROWS, size))
+    fresh = new_state(noise.odometer._replace(interval=dt))[: len(PACES) if math.isfinite(noise.gate) else 0]
+    weights, pace, faults = np.zeros(ROWS), np.zeros((3, size)), np.tile(fresh, (members + 1, 1, 1))
+    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, weights, hits, pace, faults, np.zeros(3))
+
+
 @part
 def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt: float, noise: PoseNoise) -> None:
     """Move one member by its odometry.
 
     th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) u / (1 + s), and P' = F P F^T + G Q G^T with the
-    derivatives of these; s and b decay (Gauss-Markov).
+    derivatives of these; s and b decay (Gauss-Markov). Where fixes show that the odometry fails, they correct it.
 
     Args:
         poses: the state.
@@ -67,8 +81,11 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
     heading = x[member + HEADING] + 0.5 * dt * (rate - bias)
     cos, sin, up = dt * scale * math.cos(heading), dt * scale * math.sin(heading), dt * scale * up
     east, north = cos * forward - sin * left, sin * forward + cos * left
-    x[member] += east
-    x[member + 1] += north
+    world = poses.pace[2, member : member + 3]
+    world[0], world[1] = east / dt, north / dt
+    more = correct(poses.faults[member // d], world, dt)
+    x[member] += dt * world[0]
+    x[member + 1] += dt * world[1]
     x[member + 2] += up
     x[member + HEADING] += dt * (rate - bias)
     for i in range(member + 4, member + min(d, OFFSET)):
@@ -76,8 +93,8 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
     move_rows(cov, member, d, (east, north, up), scale, dt, noise.keep)
     move_rows(cov.T, member, d, (east, north, up), scale, dt, noise.keep)
     symmetrise(cov, member, d)
-    cov[member, member] += cos * cos * q[0] + sin * sin * q[1]
-    cov[member + 1, member + 1] += sin * sin * q[0] + cos * cos * q[1]
+    cov[member, member] += cos * cos * q[0] + sin * sin * q[1] + more
+    cov[member + 1, member + 1] += sin * sin * q[0] + cos * cos * q[1] + more
     cov[member, member + 1] += cos * sin * (q[0] - q[1])
     cov[member + 1, member] += cos * sin * (q[0] - q[1])
     cov[member + 2, member + 2] += (dt * scale) * (dt * scale) * q[2]
@@ -130,6 +147,9 @@ def symmetrise(cov: Floats, member: int, d: int) -> None:
 def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> None:
     """Begin a member where its fix and compass place it, and know nothing of it yet."""
     poses.hits[member] = poses.hits[member + 1] = INITIAL_LOCKOUT
+    for i in range(poses.faults.shape[1]):
+        for j in range(SIZE):
+            poses.faults[member // d, i, j] = poses.faults[-1, i, j]
     for i in range(member, member + d):
         for j in range(len(poses.x)):
             poses.cov[i, j] = poses.cov[j, i] = 0.0

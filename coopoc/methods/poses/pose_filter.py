@@ -252,14 +252,14 @@ class PoseFilter:
             landmark: position of what they measure.
         """
         from ...kernels.poses.ekf import run_filter
-        from ...kernels.poses.scalar_update import new_poses
+        from ...kernels.poses.odometry import new_poses
 
         sensors, spread = self.assumed or recording.sensors, self._spread
         if self.spread is None and np.isfinite(recording.gnss[:, :, members]).any():
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
         noise, options = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
-        memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
+        memory = (new_poses(count, options.d, noise, recording.dt) for count in (len(members), 2))
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         return run_filter(measured, noise, first, spread, options, *memory)
 

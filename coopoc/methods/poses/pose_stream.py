@@ -95,11 +95,11 @@ class PoseStream:
     """
 
     def __init__(self, noise: "PoseNoise", options: "PoseOptions", begin: Floats, spread: Floats, dt: float) -> None:
-        from ...kernels.poses.scalar_update import new_poses
+        from ...kernels.poses.odometry import new_poses
 
         self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
         self._begin, self._later, self._heading = begin[None, None, None], False, np.nan
-        self._poses, self._pair = new_poses(options.d), new_poses(2 * options.d)
+        self._poses, self._pair = (new_poses(count, options.d, noise, dt) for count in (1, 2))
 
     def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
         """Pose of the ego now.
