@@ -62,7 +62,7 @@ def bundled(name: str) -> Fleet:
     return replace(read_table(FLEETS / f"{name}.parquet"), source=source, licence=made["map_licence"])
 
 
-DATASETS: Mapping[str, Callable[[], Fleet]] = {
+DATASETS = {
     "town04": partial(bundled, "town04"),
     "town10": partial(bundled, "town10"),
     "town10-clients": partial(bundled, "town10-clients"),

@@ -10,7 +10,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from coopoc import Fleet, InputError, Recording
+from coopoc import InputError, Recording
 from coopoc.errors import suggestion
 from coopoc.paths import given_path
 from coopoc.plugins import in_file, names
@@ -93,7 +93,7 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
         raise InputError(
             "since, until", actual, f"must leave two steps of the {length}", "Count from the first step, 0 s."
         )
-    part: Fleet | Recording = data.between(first, last)
+    part = data.between(first, last)
     if isinstance(part, Recording):
         note = f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s"
         return replace(part, notes=(*part.notes, note))

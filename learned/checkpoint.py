@@ -136,7 +136,7 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     made = find("coopoc.nets", net or card["kind"])
     history = tensors.pop(_HISTORY, None)
     try:
-        model: Gain = made(**card["net"])
+        model = made(**card["net"])
         model.load_state_dict(tensors)
     except (TypeError, RuntimeError) as error:
         why = " ".join(str(error).split())

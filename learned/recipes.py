@@ -83,7 +83,7 @@ class Recipe:
         return Plan(self.rounds, self.aggregate, self.local_epochs, self.schedule)
 
 
-RECIPES: dict[str, Recipe] = {
+RECIPES = {
     "fedkalmannet": Recipe("federated"),
     "centralised": Recipe("centralised", Schedule(epochs=1500)),
     "individual": Recipe("individual", Schedule(epochs=500)),

@@ -129,7 +129,7 @@ def bound(task: Task, information: str) -> float:
     """
     fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
-    clean: Recording | None = None
+    clean = None
     if sensors.outliers or task.attack.share:
         runs = 3 if information in ("past", "fleet") else task.runs  # each takes half a minute
         clean, _ = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)

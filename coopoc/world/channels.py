@@ -1,7 +1,5 @@
 """Channels by name, and the losses that they draw."""
 
-from collections.abc import Callable, Mapping
-
 import numpy as np
 
 from ..arrays import Bools, Floats
@@ -37,7 +35,7 @@ def lost(draws: Floats, loss: float, burst: float) -> Bools:
     return bad
 
 
-CHANNELS: Mapping[str, Callable[[int], V2X]] = {"ideal": V2X, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
+CHANNELS = {"ideal": V2X, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
 """Largest number of neighbours -> V2X. "ideal" counts payload only."""
 
 

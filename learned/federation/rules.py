@@ -1,7 +1,7 @@
 """Aggregation rules: mean, median, trimmed mean and Krum."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -170,7 +170,7 @@ class Krum(Rule):
         return weights[best.sort().values].mean(0)
 
 
-RULES: Mapping[str, Rule] = {
+RULES = {
     "mean": Function(mean),
     "median": Function(median),
     "trimmed_mean": TrimmedMean(),

@@ -241,7 +241,7 @@ def sparse(problem: Problem) -> Sparse:
     Raises:
         InputError: a formula that CasADi cannot run.
     """
-    kept: Sparse | None = problem.__dict__.get("sparse")
+    kept = problem.__dict__.get("sparse")
     if kept is None:
         numbers = tuple(numbers_of(factor) for factor in problem.factors)
         kept = problem.__dict__["sparse"] = Sparse(problem.space, layout_of(problem), numbers)
