@@ -192,8 +192,7 @@ def _load(point: metadata.EntryPoint, name: str) -> Any:
 
 
 def _unknown(group: str, name: object) -> InputError:
-    listed = names(group)
-    return unknown(GROUPS.get(group, group), name, listed, LISTED if group in GROUPS else None)
+    return unknown(GROUPS.get(group, group), name, names(group), LISTED if group in GROUPS else None)
 
 
 def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:

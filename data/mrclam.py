@@ -270,8 +270,7 @@ def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = np.
     errors (M,), those beyond a gate of robust standard deviations aside."""
     inlier = np.abs(error - np.median(error)) <= gate * robust_std(error)
     group = np.unique(observer[inlier] * 10**6 + np.floor(t[inlier] / ERROR_SECONDS), return_inverse=True)[1]
-    sums = np.bincount(group, error[inlier])
-    return float(np.sqrt((sums**2).sum() / inlier.sum()))
+    return float(np.sqrt((np.bincount(group, error[inlier]) ** 2).sum() / inlier.sum()))
 
 
 def _relative(log: MrclamLog, until: float) -> tuple[float, float]:

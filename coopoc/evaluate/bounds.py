@@ -136,8 +136,7 @@ def pose_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landma
     v2x = checked_noise(fleet, sensors, v2x, bool(marks))
     links = find_links(fleet, range(len(fleet.ids)), v2x, sensors.min_range, marks)
     members = [np.setdiff1d(np.flatnonzero(row), marks) for row in fleet.present]
-    stages = pose_stages(fleet, sensors, links, members)
-    return _marginals(fleet, stages, smoothing=False)
+    return _marginals(fleet, pose_stages(fleet, sensors, links, members), smoothing=False)
 
 
 def bound_rt_le(cov: Floats) -> float:

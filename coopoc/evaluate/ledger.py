@@ -70,8 +70,7 @@ class Ledger:
 
     def per_vehicle(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
         """Bytes of all, servers included, for each vehicle: the mean over runs."""
-        vehicles = len(self.names) - len(self.servers)
-        return float(self.of(kind, way).sum(axis=1).mean()) / max(vehicles, 1)
+        return float(self.of(kind, way).sum(axis=1).mean()) / max(len(self.names) - len(self.servers), 1)
 
     def rate(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
         """Bytes per second of driving and vehicle; InputError without any driving."""

@@ -125,8 +125,7 @@ def edges_of(kind: str, nodes: npt.ArrayLike, values: Floats, covariance: Floats
         stamps: (M,) s.
     """
     if kind == "ranges":
-        arrays = (values[:, 0], covariance[:, 0, 0])
-        return RangeEdges(nodes, *arrays, stamps)  # type: ignore[arg-type]
+        return RangeEdges(nodes, values[:, 0], covariance[:, 0, 0], stamps)  # type: ignore[arg-type]
     if "point" in kind:
         return PointEdges(nodes, values, covariance, stamps)  # type: ignore[arg-type]
     d = 2 if values.shape[1] == 3 else 3

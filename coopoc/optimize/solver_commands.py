@@ -58,8 +58,7 @@ def solve_file(
     """
     if output is not None:
         one_of("ending of --output", replaceable(output).suffix, (".json",))
-    graph = load_graph(file, repair)
-    problem = from_graph(graph, objective, "odometry" if outliers else start)
+    problem = from_graph(load_graph(file, repair), objective, "odometry" if outliers else start)
     say(str(problem))
     solve_one = partial(solve, throw=False, covariance=covariance or None)
     solution = (without_outliers if outliers else solve_one)(problem, backend)

@@ -122,8 +122,7 @@ def per_seed(results: Results, where: Where, value: str = "rt_le_m") -> Floats:
 
 def seed_means(results: Results, where: Where) -> list[float]:
     """Mean RT-LE for each training seed, m; of a method that is not trained one, and none if it was not run."""
-    seeds = _seeds(results, where)
-    wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
+    wheres = [{**where, "train_seed": seed} for seed in _seeds(results, where)] or [dict(where)]
     return [value for each in wheres if (value := mean(results, each)) is not None]
 
 

@@ -125,8 +125,7 @@ class Reference:
     def load(cls, path: str | Path) -> "Reference":
         """Read what `save` wrote; InputError without such a file, or for a damaged one."""
         path, hint = given_path(path), "Write them with coopoc reference --write."
-        fields = {"study": str, "settings": dict, "numbers": list}
-        document = store.content(path, fields, hint)
+        document = store.content(path, {"study": str, "settings": dict, "numbers": list}, hint)
         try:
             numbers = tuple(
                 Number(**{name: NUMBER_READERS[name](each[name]) for name in NUMBER_READERS})

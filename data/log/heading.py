@@ -162,8 +162,7 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
         rise: Floats = np.nan_to_num(4.0 * noise * held(square, times)[:, 0] ** 2) ** (1 / 3)
         return rise
 
-    s = float(np.sqrt(np.median(variance[known])))
-    return Course(at, "fixes", of_pace=of_pace, unsure=s), factor
+    return Course(at, "fixes", of_pace=of_pace, unsure=float(np.sqrt(np.median(variance[known])))), factor
 
 
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:

@@ -121,8 +121,7 @@ def in_group(rows: Rows, *groups: str) -> Bools:
 
 def stated_std(rows: Rows, *kinds: str) -> float:
     """Root mean square of the standard deviations of these kinds that were logged; NaN if none was."""
-    std = only(rows, *kinds)["std"].dropna()
-    return float(np.sqrt((std**2).mean()))
+    return float(np.sqrt((only(rows, *kinds)["std"] ** 2).mean()))
 
 
 def row_of(rows: Rows) -> str:
