@@ -61,7 +61,7 @@ class Incremental:
                 that nothing holds; the estimate is as before.
         """
         space, first, new = self._problem.space, len(self.names), dict(values or {})
-        d, x, late_poses = space.dimension, np.zeros((len(new), space.ambient)), set[int]()
+        d, x, late_poses = space.dimension, np.zeros((len(new), space.ambient)), set()
         for k, (name, value) in enumerate(new.items()):
             if not isinstance(name, str):
                 raise InputError("values", shown(name), "must have names of nodes", "Give a str.")
@@ -82,7 +82,7 @@ class Incremental:
             known_index = index_of(node, index_of_name, every)
             return known_index if known_index >= first else self._index(known_index)
 
-        made = list[Factor]()
+        made = []
         for each in several(factors):
             if not isinstance(each, Factor):
                 if isinstance(each, str) or not isinstance(each, Sequence) or not 3 <= len(each) <= 4:
@@ -160,7 +160,7 @@ class Incremental:
             graph.add(old.at(k))
         for key in filter(guess.exists, new):
             guess.erase(key)
-        params, used = self.isam.params(), list[Any]()
+        params, used = self.isam.params(), []
         params.setFactorization("QR")
         if self.lag:
             used = [{key: at for key, at in self.isam.timestamps().items() if guess.exists(key)}]
