@@ -8,7 +8,6 @@ import pytest
 from conftest import refused, textbook, with_masts, without
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import pose_filter as oracle
-from oracles.pace import heard
 from shell import ROOT, python
 
 import coopoc as co
@@ -88,46 +87,21 @@ def test_with_a_perfect_heading_it_is_the_position_filter(neighbours, formation)
     assert 1.0 < np.square(co.rt_le(here, drive)).mean() / square < 1.2
 
 
-def test_a_fleet_is_filterpys_extended_kalman_filter(formation):
-    """filterpy's predict and update with this model's derivatives, four members, 40 steps."""
+def test_an_update_of_the_oracle_is_filterpys():
+    """One pass of what the dense oracle stacks is the update of filterpy's extended Kalman filter."""
     filterpy = pytest.importorskip("filterpy.kalman")
-    drive = formation.select(range(4)).between(0, 40)
-    noise = replace(NOISE, speed_scale_std=0.0, yaw_rate_bias_std=0.0)
-    seen = co.observe(drive, noise, co.V2X(max_neighbours=3, radius=1e3), frame="body")
-    track = textbook(co.PoseFilter("fleet", exact=False))(seen)
-    packed = pose_measurements(seen, range(4), np.arange(len(seen.links)))
-    motion = heard(seen, None, co.NoiseModel.nominal(noise), 0, 0) / seen.dt**2
-    ekf = filterpy.ExtendedKalmanFilter(16, 1)
-    ekf.x = packed.own[0, 0, :, :4].flatten()
-    ekf.P = np.diag([1e6, 1e6, 1e6, np.pi**2 / 3] * 4)
-    for t in range(40):
-        if t:
-            F, Q = np.eye(16), np.zeros((16, 16))
-            for k in range(4):
-                u, b = packed.own[0, t, k, 4:], slice(4 * k, 4 * k + 4)
-                state = ekf.x[b].copy()
-                F[b, b] = oracle.jacobian(lambda s, u=u: oracle.motion(s, u, seen.dt), state)
-                G = oracle.jacobian(lambda v, s=state: oracle.motion(s, v, seen.dt), u)
-                q = np.append(motion[t, k], 0.02**2)
-                Q[b, b], ekf.x[b] = G @ np.diag(q) @ G.T, oracle.motion(state, u, seen.dt)
-            ekf.P = F @ ekf.P @ F.T + Q
-        for k in range(4):
-            H = np.zeros((4, 16))
-            H[:, 4 * k : 4 * k + 4] = np.eye(4)
-            z = packed.own[0, t, k, :4].copy()
-            z[3] = ekf.x[4 * k + 3] + oracle.wrapped(z[3] - ekf.x[4 * k + 3], True)
-            ekf.update(z, lambda x, H=H: H, lambda x, H=H: H @ x, np.diag([1.0, 1.0, 0.25, 0.05**2]))
-        mine = range(packed.first[t], packed.first[t + 1])
+    rng, variances = np.random.default_rng(0), np.array([0.3, 0.03, 0.03]) ** 2
+    root, begin = rng.normal(size=(8, 8)), np.array([0.0, 1.0, 2.0, 0.3, 9.0, 4.0, 3.0, -0.5])
 
-        def h(x, pairs=4 * packed.ends[mine]):
-            return np.concatenate([oracle.spherical(x[i : i + 4], x[j : j + 3]) for i, j in pairs])
+    def seen(x):
+        return oracle.spherical(x[:4], x[4:7])
 
-        z, angle = packed.relative[0, mine].ravel(), np.tile([False, True, True], len(mine))
-        z = h(ekf.x) + oracle.wrapped(z - h(ekf.x), angle)
-        noises = np.diag(np.tile(np.square([0.3, 0.03, 0.03]), len(mine)))
-        ekf.update(z, lambda x, h=h: oracle.jacobian(h, x), h, noises)
-        assert np.allclose(track.x[0, t, 0], ekf.x[:3], atol=1e-5)
-        assert np.allclose(track.covariance[0, t, 0], ekf.P[:3, :3], rtol=1e-4, atol=1e-7)  # type: ignore[index]
+    z, ekf = seen(begin) + 0.1 * rng.normal(size=3), filterpy.ExtendedKalmanFilter(8, 3)
+    ekf.x, ekf.P = begin.copy(), root @ root.T
+    x, cov = oracle.update(begin, ekf.P.copy(), seen, z, lambda _: variances, [False] * 3)
+    ekf.update(z, lambda x: oracle.jacobian(seen, x), seen, np.diag(variances))
+    assert_allclose(x, ekf.x, atol=1e-9)
+    assert_allclose(cov, ekf.P, atol=1e-9)
 
 
 def test_it_is_as_good_as_with_ten_passes(crossing, monkeypatch):
