@@ -41,9 +41,10 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
     array = np.array(values_array, dtype, order="C", copy=None)
     if not array.flags.aligned:
         array = array.copy()
-    owners = (array, array.base) if array is values_array and not isinstance(values, list | tuple) else ()
-    if any(isinstance(owner, np.ndarray) and owner.flags.writeable for owner in owners):
-        array = array.copy()  # the caller may go on writing to its own, or to what it shows a part of
+    if array is values_array and not isinstance(values, list | tuple):
+        owner = array.base if isinstance(array.base, np.ndarray) else array
+        if array.flags.writeable or owner.flags.writeable:
+            array = array.copy()  # the caller may go on writing to its own, or to what it shows a part of
     array.flags.writeable = False
     return array
 
@@ -279,7 +280,7 @@ def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hin
     Traceback (most recent call last):
     coopoc.errors.InputError: step[1] = -1: must be >= 0. Count steps from 0.
     """
-    if np.any(wrong):
+    if np.asarray(wrong).any():
         first_wrong = tuple(np.argwhere(wrong)[0].tolist())
         raise InputError(f"{field}{[*first_wrong] or ''}", values[first_wrong], allowed, hint)
 

@@ -12,8 +12,8 @@ from ..arrays import Floats, checked, instance, number
 from ..errors import InputError, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
-from .model.factor import Factor, fused, stacked, unchecked
-from .model.problem import Problem, index_of, indices, points, rows, several
+from .model.factor import Factor, fused, unchecked
+from .model.problem import Problem, check_item, index_of, indices, points, rows, several
 from .solution import Solution
 from .solve import solve
 from .starts.initial import initial_guess
@@ -92,12 +92,14 @@ class Incremental:
                 at = indices(index, kind, nodes)
                 each = Factor(kind, at, rows(kind, z, len(at)), *std)
             made.append(each)
-        used = np.unique(stacked([*(f.nodes.ravel() for f in made), np.arange(first, len(every))])).tolist()
+        used = sorted({*range(first, len(every)), *(k for f in made for k in f.nodes.ravel().tolist())})
         names = [every[index(k)] for k in used]
         poses = [k for k, node in enumerate(used) if node in self._poses or node in late_poses]
         local = [unchecked(f, nodes=np.searchsorted(used, f.nodes)) for f in made]
-        part = Problem(tuple(names), local, dimension=d, poses=tuple(poses))
+        part = self._problem.replace_unchecked(names=tuple(names), factors=local, poses=tuple(poses), fixed=(), x0=None)
         part.__dict__["space"] = space
+        for factor in local:
+            check_item(factor, names, frozenset(poses), d)
         self._step(part, used, x)
         self._poses |= late_poses
         self._place.update(fresh)
@@ -113,10 +115,11 @@ class Incremental:
             lacking, allowed = repr(part.factors[stated.index(None)]), "must be one that GTSAM has a factor for"
             hint = "relative_pose_log takes any covariance and loss; solve() takes all."
             raise InputError("factors", lacking, allowed, hint)
-        if free := ", ".join(self._free(part, keys, x)[:5]):
+        points = sorted({*range(old, len(keys))} - {*part.poses})
+        if free := ", ".join(self._free(part, keys, x, points)[:5]):
             raise InputError("factors", f"leave {free} free", "must hold every new pose", "Add a relative pose.")
         graph, guess = graph_of(part, stated, keys), values(part.space, which_turn(part)[old:], x, *keys[old:][:1])
-        for key, place, information in self._vague(part, keys, x):
+        for key, place, information in self._vague(part, keys, x, points):
             vague = gtsam.noiseModel.Isotropic.Precision(len(place), information)
             graph.add(gtsam.__dict__[f"PriorFactorPoint{len(place)}"](key, place, vague))
         used = [dict.fromkeys(keys, float(self._steps))] if self.lag else []
@@ -132,13 +135,14 @@ class Incremental:
                     raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
         self._steps += 1
 
-    def _vague(self, part: Problem, keys: Sequence[int], x: Floats) -> Iterator[tuple[int, Floats, float]]:
-        """Keys and places of new points, and the information of their priors, 1/m^2."""
-        points = np.setdiff1d(np.arange(len(keys) - len(x), len(keys)), part.poses)
-        if len(points):
+    def _vague(
+        self, part: Problem, keys: Sequence[int], x: Floats, points: list[int]
+    ) -> Iterator[tuple[int, Floats, float]]:
+        """Keys and places of the new points, and the information of their priors, 1/m^2."""
+        if points:
             at, d, dof = self._at(keys, x), part.dimension, part.space.dof
             J = part.whiten(at)[1].tocsc()
-        for k in points.tolist():
+        for k in points:
             own = J[:, k * dof : k * dof + d]
             least, *_, most = np.linalg.eigvalsh(np.nan_to_num((own.T @ own).toarray())).tolist()
             yield keys[k], at[k, :d], max(VAGUE * most * (least <= VAGUE * most), LOOSE**-2)
@@ -167,7 +171,7 @@ class Incremental:
         self.isam = gtsam.IncrementalFixedLagSmoother(self.lag, params) if self.lag else gtsam.ISAM2(params)
         self.isam.update(graph, guess, *used)
 
-    def _free(self, part: Problem, keys: Sequence[int], x: Floats) -> list[str]:
+    def _free(self, part: Problem, keys: Sequence[int], x: Floats, points: list[int]) -> list[str]:
         """New poses that the factors of a step leave free where older nodes are known, and new points to LOOSE: only
         of those that no whole relative poses hold the null space is looked at."""
         d, older = part.dimension, range(len(keys) - len(x))
@@ -178,8 +182,8 @@ class Incremental:
                     held.update(nodes if len(nodes) == 1 or not held.isdisjoint(nodes) else [])
         loose = {part.names[k] for k in {*part.poses} - held}
         if loose:
-            at, points = self._at(keys, x), np.setdiff1d(np.arange(len(keys)), [*older, *part.poses])
-            vague = [Factor("position", points[:, None], at[points, :d], std=np.full(d, LOOSE))] if len(points) else []
+            at = self._at(keys, x)
+            vague = [Factor("position", [[k] for k in points], at[points, :d], std=LOOSE)] if points else []
             old_fixed = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
             loose.intersection_update(assess(old_fixed, at, covariance=False).unobservable)
         return sorted(loose)

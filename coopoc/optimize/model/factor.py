@@ -156,7 +156,7 @@ class Factor:
     def measured(self) -> Ints:
         """(M,) numbers that carry information: the rank of W."""
         if self.std is not None:
-            return np.broadcast_to(np.isfinite(self.std).sum(axis=1), len(self.nodes))
+            return np.full(len(self.nodes), np.isfinite(self.std).sum(axis=1))
         root, rank = self.root, np.full(len(self.nodes), self.size)
         flat = ~(np.abs(np.linalg.det(root)) > DEPENDENT_VOLUME * np.linalg.norm(root, axis=2).prod(axis=1))
         if flat.any():  # the rank takes as long as many steps of a solve

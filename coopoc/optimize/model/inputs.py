@@ -74,7 +74,7 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
         raise InputError(
             "constants", values.tolist(), f"must be {measurement.constants} finite numbers for {measurement.name}", hint
         )
-    return frozen(np.broadcast_to(values, (count, measurement.constants)))
+    return frozen(np.full((count, measurement.constants), values))
 
 
 def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
@@ -115,7 +115,7 @@ def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple
     """std as (M or 1, size): > 0, angles at most pi."""
     field, size = f"std of {measurement.name}", shape[-1]
     array = checked(field, std)
-    wide = np.broadcast_to(array, (1, size)) if array.ndim < 2 and array.size in (1, size) else array
+    wide = np.full((1, size), array) if array.ndim < 2 and array.size in (1, size) else array
     if wide.ndim != 2 or wide.shape[1] != size or len(wide) not in (1, shape[0]):
         allowed = f"must have shape ({size},) or {shape}"
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
