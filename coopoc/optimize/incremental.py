@@ -13,7 +13,7 @@ from ..errors import InputError, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
 from .model.factor import Factor, fused, unchecked
-from .model.problem import Problem, check_item, index_of, indices, points, rows, several
+from .model.problem import Problem, index_of, indices, points, rows, several
 from .solution import Solution
 from .solve import solve
 from .starts.initial import initial_guess
@@ -99,7 +99,7 @@ class Incremental:
         part = self._problem.replace_unchecked(names=tuple(names), factors=local, poses=tuple(poses), fixed=(), x0=None)
         part.__dict__["space"] = space
         for factor in local:
-            check_item(factor, names, frozenset(poses), d)
+            part._check(factor)
         self._step(part, used, x)
         self._poses |= late_poses
         self._place.update(fresh)
