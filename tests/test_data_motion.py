@@ -19,7 +19,8 @@ from coopoc.arrays import Floats
 from coopoc.data.log.check import check
 from coopoc.data.log.read import Log
 from coopoc.kernels.constant_velocity import BANK, constant_velocity
-from coopoc.world.body_frames import in_world
+from coopoc.world.body_frames import in_world, turned
+from coopoc.world.links import wrap
 
 T = np.round(np.arange(0, 180, 0.1), 1)
 TUNNEL = [k for k in range(0, len(T), 10) if not 600 < k < 900]
@@ -129,6 +130,23 @@ def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_
     assert_allclose(world.velocity, ideal.recording.velocity, atol=0.03)
     method = co.PoseFilter("solo") if frame == "body" else co.Kalman()
     assert error(read, method) < 1.3 * error(ideal, co.Kalman())
+
+
+def test_a_body_velocity_that_errs_for_long_misleads_no_pose_filter(tmp_path):
+    """By 3 % and 0.1 m/s on each axis; beside the filter that is told the errors, from when fixes have shown them."""
+    u, off, rng = np.gradient(path("drone"), 0.1, axis=0), list[float](), np.random.default_rng(5)
+    heading = wrap(0.3 * T + rng.normal(0, 0.02, len(T)))
+    turn = {"heading": heading, "heading_std": 0 * T + 0.02, "yaw_rate": 0 * T + 0.3}
+    for name, bias in (("slow", 0.1), ("ideal", 0.0)):
+        own = turned(u, -0.3 * T) * (1 + 0.3 * bias) + [bias, -bias, bias] + rng.normal(0, 0.05, u.shape)
+        more = dict(zip(("vx_body", "vy_body", "vz_body"), own.T, strict=True)) | turn
+        log(tmp_path / name, "drone", 0.5, 10, **more, vx_body_std=0 * T + 0.05)
+        rec = co.read_log(tmp_path / name, frame="body").recording
+        told = rec.sensors if bias else replace(rec.sensors, speed_scale_std=0.0, velocity_bias_std=0.0)
+        track = co.PoseFilter("solo", assumed=told)(rec)
+        off.append(np.linalg.norm(track.x[0, 600:, 0] - path("drone")[600:], axis=1).mean())
+        assert not bias or track.extras["vz_error"][0, -1] == pytest.approx(0.1, abs=0.02)
+    assert off[0] < 1.3 * off[1]
 
 
 def test_each_fix_counts_as_it_is_stated(tmp_path):

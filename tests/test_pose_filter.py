@@ -50,7 +50,8 @@ def rough(crossing):
 
 
 @pytest.mark.parametrize(
-    ("kind", "d", "exact"), [("solo", 6, False), ("fleet", 4, True), ("fleet", 6, False), ("fleet", 7, True)]
+    ("kind", "d", "exact"),
+    [("solo", 6, False), ("fleet", 4, True), ("fleet", 6, False), ("fleet", 7, True), ("fleet", 10, True)],
 )
 def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact):
     """Gaps, losses, members that come and go, landmarks, range only and bearing only."""
@@ -59,7 +60,7 @@ def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact):
     links = to_landmarks(rough, mine) if kind == "solo" else np.arange(len(rough.links))
     begin, spread = np.full((2, 10, 4), np.nan), (1.0, 1.0, 1.0, 0.1)
     begin[:, 0] = [*rough.gnss[0, 0, 0], 0.3]
-    told = replace(NOISE, range_offset_std=0.5 * (d > 6))
+    told = replace(NOISE, range_offset_std=0.5 * (d > 6), velocity_bias_std=0.2 * (d > 7))
     method = textbook(co.PoseFilter(kind, lasting=d > 4, exact=exact, spread=spread, assumed=told))  # type: ignore[arg-type]
     x, cov, _ = method._run_filter(rough, members, links, begin)
     measured, noise = pose_measurements(rough, members, links), pose_noise(told, rough.dt, np.inf)

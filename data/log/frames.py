@@ -31,6 +31,8 @@ PERIODS = 3600.0, WEEK / 7, WEEK, 2**32 / 1000, 1024 * WEEK
 the number of a week."""
 SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
+VELOCITY_BIAS_STD = 0.1
+"""m/s, of each axis of a velocity that no wheel measures."""
 OFFSET_STD = 1.0
 """m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
 DRIVES_APART = 3600.0
@@ -237,6 +239,7 @@ def assumed(
         rate = rare * of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
+        noise["velocity_bias_std"] = VELOCITY_BIAS_STD * ("vy_body" in used)
     derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], axis=0).tolist()
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")

@@ -19,7 +19,8 @@ def motion(state, inputs, dt):  # type: ignore[no-untyped-def]
     scale, bias = (state[4], state[5]) if len(state) > 4 else (0.0, 0.0)
     turn = dt * (inputs[3] - bias)
     c, s = np.cos(state[3] + turn / 2), np.sin(state[3] + turn / 2)
-    u = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ inputs[:3] / (1 + scale)
+    slow = state[7:] if len(state) > 7 else 0.0
+    u = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ (inputs[:3] - slow) / (1 + scale)
     return np.concatenate([state[:3] + dt * u, [state[3] + turn], state[4:]])
 
 
@@ -56,7 +57,8 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
     x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
     pace = np.zeros((members, 3))
-    grown = (lasting * [1 - noise.keep**2, 1 - noise.keep**2, 0][: d - 4]).tolist()  # an offset stays
+    keep = np.array([noise.keep] * 2 + [1] + [noise.keep] * 3)[: d - 4]  # an offset stays
+    grown = (lasting * (1 - keep**2)).tolist()
     for t in range(steps):
         F, Q = [], []
         for n in range(members):
@@ -68,10 +70,10 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
                 q = np.append(np.maximum(odometer.ratio * size, odometer.floor) ** 2, noise.yaw_rate)
                 F.append(jacobian(lambda s, u=u: motion(s, u, drive.dt), state))
                 G = jacobian(lambda v, s=state: motion(s, v, drive.dt), u)
-                F[-1][4:6] *= noise.keep
+                F[-1][4:] *= keep[:, None]
                 Q.append(G @ np.diag(q) @ G.T + np.diag([0, 0, 0, 0, *grown]))
                 x[n] = motion(state, u, drive.dt)
-                x[n, 4:6] *= noise.keep
+                x[n, 4:] *= keep
                 continue
             F.append(np.zeros((d, d)))
             pace[n] = own[4:7] ** 2

@@ -55,7 +55,7 @@ class PoseOptions(NamedTuple):
     """How members are filtered.
 
     Attributes:
-        d: numbers of a member, 4, 6 or 7.
+        d: numbers of a member, 4, 6, 7 or 10.
         passes: of the relative measurements, each linear at the state that the last one found.
         fusion: JOINT, NAIVE or INTERSECTION.
     """

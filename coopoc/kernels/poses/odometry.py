@@ -11,7 +11,7 @@ from ..compiling.vectors import LANES
 from ..gate import INITIAL_LOCKOUT
 from ..motion import MotionNoise, keep_pace, process_variance
 from ..odometry_fault import PACES, SIZE, correct, new_state
-from .scalar_update import HEADING, OFFSET, ROWS, Poses, Three
+from .scalar_update import HEADING, OFFSET, ROWS, SLOW, Poses, Three
 
 UNKNOWN_HEADING_RAD2 = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
@@ -26,9 +26,10 @@ class PoseNoise(NamedTuple):
         relative: three variances, m^2, rad^2, rad^2.
         odometer: of a velocity, as of the motion of 1 s.
         yaw_rate: rad^2/s^2.
-        lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, and of the offset of ranges, m^2.
+        lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, of the offset of ranges, m^2, and of
+            the slow error of a velocity on three axes, m^2/s^2.
         longer: 1 where that offset is a state, else 0.
-        keep: share of scale error and bias that is left after a step.
+        keep: share of these but the offset that is left after a step.
         flat: m^2, prior of a member that joins.
         gate: squared normalised innovation beyond which a measurement weighs less.
     """
@@ -38,7 +39,7 @@ class PoseNoise(NamedTuple):
     relative: Three
     odometer: MotionNoise
     yaw_rate: float
-    lasting: Three
+    lasting: tuple[float, float, float, float, float, float]
     longer: float
     keep: float
     flat: float
@@ -59,8 +60,8 @@ def new_poses(members: int, d: int, noise: PoseNoise, dt: float) -> Poses:
 def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt: float, noise: PoseNoise) -> None:
     """Move one member by its odometry.
 
-    th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) u / (1 + s), and P' = F P F^T + G Q G^T with the
-    derivatives of these; s and b decay (Gauss-Markov). Where fixes show that the odometry fails, they correct it.
+    th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) (u - e) / (1 + s), and P' = F P F^T + G Q G^T with the
+    derivatives of these; s, b and e decay (Gauss-Markov). Where fixes show that the odometry fails, they correct it.
 
     Args:
         poses: the state.
@@ -78,6 +79,9 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
     scale, bias = 1.0, 0.0
     if d > 4:
         scale, bias = 1.0 / (1.0 + x[member + 4]), x[member + 5]
+    if d > SLOW:
+        e = member + SLOW
+        forward, left, up = forward - x[e], left - x[e + 1], up - x[e + 2]
     heading = x[member + HEADING] + 0.5 * dt * (rate - bias)
     cos, sin, up = dt * scale * math.cos(heading), dt * scale * math.sin(heading), dt * scale * up
     east, north = cos * forward - sin * left, sin * forward + cos * left
@@ -88,10 +92,10 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
     x[member + 1] += dt * world[1]
     x[member + 2] += up
     x[member + HEADING] += dt * (rate - bias)
-    for i in range(member + 4, member + min(d, OFFSET)):
-        x[i] *= noise.keep
-    move_rows(cov, member, d, (east, north, up), scale, dt, noise.keep)
-    move_rows(cov.T, member, d, (east, north, up), scale, dt, noise.keep)
+    for i in range(4, d):
+        x[member + i] *= noise.keep if i != OFFSET else 1.0
+    move_rows(cov, member, d, (east, north, up), (cos, sin), scale, dt, noise.keep)
+    move_rows(cov.T, member, d, (east, north, up), (cos, sin), scale, dt, noise.keep)
     symmetrise(cov, member, d)
     cov[member, member] += cos * cos * q[0] + sin * sin * q[1] + more
     cov[member + 1, member + 1] += sin * sin * q[0] + cos * cos * q[1] + more
@@ -102,12 +106,15 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
     for i in range(4):
         for j in range(4):
             cov[member + i, member + j] += effect[i] * effect[j] * noise.yaw_rate
-    for i in range(4, min(d, OFFSET)):
-        cov[member + i, member + i] += (1.0 - noise.keep * noise.keep) * noise.lasting[i - 4]
+    for i in range(4, d):
+        if i != OFFSET:
+            cov[member + i, member + i] += (1.0 - noise.keep * noise.keep) * noise.lasting[i - 4]
 
 
 @part
-def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: float, keep: float) -> None:
+def move_rows(
+    cov: Floats, member: int, d: int, moved: Three, turn: tuple[float, float], scale: float, dt: float, keep: float
+) -> None:
     """F P in the rows of a member; the transposed of it, moved once more, is F P F^T.
 
     Args:
@@ -115,9 +122,10 @@ def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: 
         member: its first number.
         d: numbers of a member.
         moved: east, north and up m.
+        turn: cosine and sine of the heading, times scale and dt.
         scale: 1 / (1 + s).
         dt: s.
-        keep: share of s and b that is left.
+        keep: share of s, b and e that is left.
     """
     east, north, up = moved
     for j in range(len(cov)):
@@ -132,6 +140,15 @@ def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: 
             cov[member + HEADING, j] += db
             cov[member + 4, j] *= keep
             cov[member + 5, j] *= keep
+    if d > SLOW:
+        (cos, sin), e = turn, member + SLOW
+        for j in range(len(cov)):
+            forward, left = cov[e, j], cov[e + 1, j]
+            cov[member, j] -= cos * forward - sin * left
+            cov[member + 1, j] -= sin * forward + cos * left
+            cov[member + 2, j] -= dt * scale * cov[e + 2, j]
+            for i in range(e, e + 3):
+                cov[i, j] *= keep
 
 
 @part

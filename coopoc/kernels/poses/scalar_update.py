@@ -1,9 +1,9 @@
 """Sequential scalar EKF update of the joint pose state, and the rows of compasses, fixes, ranges and angles.
 
-The state of a member is d = 4, 6 or 7 numbers: position m, heading rad and, of six, the odometer's scale error and the
-yaw rate's bias rad/s, of seven also what its ranges are too long by, m. A row is linear in the pose of one member and
-that offset, (a, b, c, h, o), and at most in the position of another, (-a, -b, -c): every measurement here is one of the
-vector between the two and of the first one's heading.
+The state of a member is d = 4, 6, 7 or 10 numbers: position m, heading rad and, of six, the odometer's scale error and
+the yaw rate's bias rad/s, of seven also what its ranges are too long by, m, of ten also the slow error of its velocity,
+m/s. A row is linear in the pose of one member and that offset, (a, b, c, h, o), and at most in the position of another,
+(-a, -b, -c): every measurement here is one of the vector between the two and of the first one's heading.
 """
 
 import math
@@ -22,6 +22,8 @@ HEADING = 3
 """Index of the heading in a member's state."""
 OFFSET = 6
 """Index of the offset of its ranges."""
+SLOW = 7
+"""Index of the error of its velocity forward; those left and up follow."""
 ROWS = 4
 """Rows that may be pending, so that one pass over the covariance serves them all."""
 MIN_ANGLE_DISTANCE = 1e-3

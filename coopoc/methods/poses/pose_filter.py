@@ -62,8 +62,8 @@ class PoseFilter:
         fusion: of a fleet. "joint": one state with all cross-covariances, at a centre, the optimum. Decentralised, each
             vehicle fuses the estimates that reach it in time: "naive" as if their errors were independent;
             "intersection" by covariance intersection.
-        lasting: estimate the odometer's scale error, the yaw rate's bias and, if assumed, an offset of ranges, too
-            (`Track.extras`); None where the noise has any of them, as that of a log.
+        lasting: estimate the odometer's scale error, the yaw rate's bias and, if assumed, an offset of ranges and a
+            slow error of the velocity, too (`Track.extras`); None where the noise has any of them, as that of a log.
         exact: False is the plain extended Kalman filter.
         robust: a component beyond its gate weighs less, far beyond it nothing, unless many are
             (`coopoc.kernels.gate`); False believes every number.
@@ -172,7 +172,8 @@ class PoseFilter:
         positions = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
         notes += doubts(_in_world(recording, columns, x[..., 3]), columns, *positions, neighbours=theirs)
         extras: dict[str, Floats] = {}
-        for k, name in enumerate(("speed_scale", "yaw_rate_bias", "range_offset")[: x.shape[-1] - 4], 4):
+        lasting = "speed_scale", "yaw_rate_bias", "range_offset", *(f"{axis}_error" for axis in ("vx", "vy", "vz"))
+        for k, name in enumerate(lasting[: x.shape[-1] - 4], 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
         absent = ~present(recording)[:, columns]
         track = Track(
@@ -269,6 +270,7 @@ class PoseFilter:
 
         noise = pose_noise(sensors, dt, self.gate if self.robust else np.inf, self.lasting is not False)
         numbers = 4 + 2 * (self.lasting is True or any(noise.lasting)) + int(noise.longer)
+        numbers = 10 if any(noise.lasting[3:]) else numbers
         return noise, PoseOptions(numbers, PASSES if self.exact else 1, get_args(Fusion).index(self.fusion))
 
 
