@@ -183,7 +183,9 @@ class Incremental:
         loose = {part.names[k] for k in {*part.poses} - held}
         if loose:
             at = self._at(keys, x)
-            vague = [Factor("position", [[k] for k in points], at[points, :d], std=LOOSE)] if points else []
+            vague = (
+                [Factor("position", np.array(points)[:, None], at[points, :d], std=np.full(d, LOOSE))] if points else []
+            )
             old_fixed = part.replace_unchecked(fixed=(*part.fixed, *older), factors=(*part.factors, *vague))
             loose.intersection_update(assess(old_fixed, at, covariance=False).unobservable)
         return sorted(loose)
