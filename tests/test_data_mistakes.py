@@ -137,6 +137,8 @@ def test_options_of_the_wrong_kind_are_refused(tmp_path, option):
     (tmp_path / "log.csv").write_text(GOOD)
     with refused(next(iter(option))):
         read_log(tmp_path / "log.csv", **option)
+    with refused("path = 3"):
+        read_log(tmp_path / "log.csv", truth=3)
 
 
 def test_every_mistake_of_the_page_is_tested():

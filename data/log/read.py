@@ -311,7 +311,7 @@ def _is_read(file: Path) -> bool:
 
 def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> Rows:
     """Rows of a file or a folder, with those of the truth: of the file that is named, of `truth.*`, or of a topic."""
-    true_files = [Path(truth)] if truth is not None else []
+    true_files = [given_path(truth)] if truth is not None else []
     if _is_bag(path):
         if not (true_files and true_files[0].exists()):
             options, true_files = {**options, "truth": str(truth or "")}, []
