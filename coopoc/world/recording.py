@@ -69,10 +69,9 @@ UNLIKELY = "unlikely: "
 UNITS_NOTE = "velocities are in m/s, headings and yaw rates in radians and anticlockwise, headings from east"
 """First word of a note on what a recording holds, and what may be wrong with odometry."""
 COMPARED_SECONDS, LONG_STDS, APART_SHARE, CONTRADICTING_SHARE = 10.0, 6.0, 0.4, 0.3
-REPEATED_SHARE, REPEATS_NOTE = 0.01, "where a receiver has no new one, give NaN"
 """s between the fixes whose distance is compared with the odometry's; standard deviations of a fix, stated and as they
 scatter, that the longer of the two must have (the shorter one: one); share of both lengths by which they contradict
-each other; share of such pairs, of all. Share of fixes that are no new ones, and what then helps."""
+each other; share of such pairs, of all."""
 NOTHING_SIMULATED = "nothing is simulated"
 """Words in the notes of a recording that holds measurements as they were logged."""
 
@@ -410,19 +409,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
     ]
     if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
         sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS_NOTE}")
-    if share := _repeated(recording):
-        sentences.append(f"{100 * share:.0f} % of the fixes of what moves repeat the last one: {REPEATS_NOTE}")
     return tuple(UNLIKELY + text for text in sentences)
-
-
-def _repeated(recording: Recording) -> float:
-    """Share of the fixes of moving vehicles, in the first run, that repeat the last one to the last digit; 0 below
-    `REPEATED_SHARE`."""
-    fixes, moves = recording.gnss[0], recording.velocity[0, 1:]
-    moving = np.isfinite(fixes[1:, :, 0]) & (np.abs(moves).max(axis=-1) > 0.0)
-    repeated = moving & (fixes[1:] == fixes[:-1]).all(axis=-1)
-    share = float(repeated.sum() / max(moving.sum(), 1))
-    return share if share > REPEATED_SHARE else 0.0
 
 
 def _contradicting(recording: Recording) -> float:
