@@ -18,7 +18,7 @@ from ..world.recording import Recording
 
 def errors(track: Track, fleet: Fleet) -> Floats:
     """Distance between estimate and truth, (R, T, E) m."""
-    return np.asarray(np.linalg.norm(track.x - _truth(track, fleet), axis=-1))
+    return np.asarray(np.linalg.norm(_truth(track, fleet) - track.x, axis=-1))
 
 
 def _truth(track: Track, fleet: Fleet) -> Floats:

@@ -383,7 +383,7 @@ class Oracle:
             return
         first, self.state = self.state, before
         rate, shows = (share * self.state.speed) ** 2, self.r[t, self.ego] @ self.white + self.state.shown**2
-        if not before.left:
+        if not before.left or p <= 0.1:
             self.keep_place(shows)
         self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
         self.step(t, rate * dt**2 + (min(rate * SLIP_HIDDEN_S**2, shows) if p <= 0.5 and dt < SLIP_HIDDEN_S else 0.0))

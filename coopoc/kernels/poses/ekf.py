@@ -133,9 +133,10 @@ def step(
     for k in range(measured.own.shape[2]):
         own = measured.own[run, t, k]
         if measured.active[t, k] and not math.isnan(own[0]):
-            lost = judge(poses.faults[k], own[0], own[1], 0.5 * (noise.fix[0] + noise.fix[1]), measured.dt)
-            poses.cov[d * k, d * k] += lost
-            poses.cov[d * k + 1, d * k + 1] += lost
+            if not math.isnan(own[3]):  # else it may be the heading that is wrong
+                lost = judge(poses.faults[k], own[0], own[1], 0.5 * (noise.fix[0] + noise.fix[1]), measured.dt)
+                poses.cov[d * k, d * k] += lost
+                poses.cov[d * k + 1, d * k + 1] += lost
             update_fix(poses, d * k, own, noise.fix, noise.gate)
         if measured.active[t, k] and not math.isnan(own[3]):
             update_heading(poses, d * k, own[3], noise.heading, noise.gate)

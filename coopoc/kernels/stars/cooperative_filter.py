@@ -271,7 +271,7 @@ def step(
     fails = tries.doubts[PENDING] > 0.0
     if slips and surprised(f, fails or failure_known):
         other.ego[NOW] = 1.0
-        if other.ego[LEFT + 3] >= NOT_REMEMBERED_M2:
+        if other.ego[LEFT + 3] >= NOT_REMEMBERED_M2 or other.ego[SLIPPED] <= 0.1:
             remember_place(other, hidden(other, tries.own))
         if fails or failure_known:
             corrected_motion(other, tries.own, tries.own[MORE] if failure_known else tries.doubts[PENDING])
