@@ -18,9 +18,20 @@ from backends_programmes import casadi_exact, osqp_linear
 from backends_star import Job, one_by_one, stars
 from timing import report, timed
 
-from coopoc.optimize.starts.initial import as_vectors
+from coopoc.optimize import Factor
+from coopoc.optimize.model.factor import unchecked
+from coopoc.optimize.model.measurements import converted_rows
 
 ROUNDS, RUNS = 7, 200
+
+
+def as_vectors(factor: Factor) -> Factor:
+    """A spherical factor as one of measured vectors, with the covariance turned by the measured angles."""
+    d, rows = converted_rows([*factor.z.T], np)
+    inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    z, nothing = d[:, None] * inverse[:, 0], np.empty((len(factor.nodes), 0))
+    root = factor.root @ inverse
+    return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)
 
 
 def jobs(runs: int = RUNS) -> list[Job]:
