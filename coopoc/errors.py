@@ -56,11 +56,12 @@ def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
     """
     names = {one.lower(): one for one in known if len(one) > 1}  # else a quaternion's qx would be meant as x
     text = (name if isinstance(name, str) else shown(name)).lower()
-    words, near = text.split("_"), difflib.get_close_matches(text, names, n=1)
-    alike = len(words) == 1 or all(
-        difflib.get_close_matches(w, near[0].split("_"), cutoff=0.75) for w in words * len(near)
-    )
-    return f"Did you mean {names[near[0]]}?" if near and alike else otherwise
+    near = difflib.get_close_matches(text, names, n=1)
+    if not near:
+        return otherwise
+    words, theirs = text.split("_"), near[0].split("_")
+    alike = len(words) == 1 or all(difflib.get_close_matches(word, theirs, cutoff=0.75) for word in words)
+    return f"Did you mean {names[near[0]]}?" if alike else otherwise
 
 
 def unknown(noun: str, name: object, names: Iterable[str], otherwise: str | None = None) -> InputError:

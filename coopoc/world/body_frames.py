@@ -96,8 +96,8 @@ def in_world(recording: Recording) -> Recording:
 def body_measurements(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> tuple[Floats, Body]:
     """Velocity (R, T, N, 3) m/s forward, left and up, yaw rate and compass heading in R runs.
 
-    u = (1 + s) u_true + n, w = w_true + b + n, with s and b Gauss-Markov of `odometry_error_time`; the noise of u takes
-    the draws of a velocity in the world. Each error has a stream of its own: adding one changes no other draws.
+    u = (1 + s) u_true + e + n, w = w_true + b + n, with s, e and b Gauss-Markov of `odometry_error_time`; the noise of
+    u takes the draws of a velocity in the world. Each error has a stream of its own: adding one changes no other draws.
 
     Args:
         fleet: the truth.
@@ -112,7 +112,8 @@ def body_measurements(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> t
     for r in range(runs):
         scale = _lasting(fleet, "speed_scale", sensors.speed_scale_std, sensors, (seed, r))
         bias = _lasting(fleet, "yaw_rate_bias", sensors.yaw_rate_bias_std, sensors, (seed, r))
-        velocity[r] = motion * (1.0 + scale[..., None]) + noise * _normals(fleet, "velocity", (seed, r), 3)
+        error = _lasting(fleet, "velocity_bias", sensors.velocity_bias_std, sensors, (seed, r), 3)
+        velocity[r] = motion * (1.0 + scale[..., None]) + error + noise * _normals(fleet, "velocity", (seed, r), 3)
         yaw[r] = rate + bias + sensors.yaw_rate_std * _normals(fleet, "yaw_rate", (seed, r))
         if sensors.compass:
             compass[r] = heading + sensors.heading_std * _normals(fleet, "heading", (seed, r))
@@ -140,11 +141,11 @@ def _normals(fleet: Fleet, sensor: str, at: tuple[int, int], *size: int) -> Floa
     return np.stack(draws, axis=1)
 
 
-def _lasting(fleet: Fleet, sensor: str, std: float, sensors: Sensors, at: tuple[int, int]) -> Floats:
-    """(T, N) of an error that lasts."""
+def _lasting(fleet: Fleet, sensor: str, std: float, sensors: Sensors, at: tuple[int, int], *size: int) -> Floats:
+    """(T, N, ...) of an error that lasts."""
     if not std:
-        return np.zeros((len(fleet.t), len(fleet.ids)))
-    return std * gauss_markov(_normals(fleet, sensor, at), fleet.dt / sensors.odometry_error_time)
+        return np.zeros((len(fleet.t), len(fleet.ids), *size))
+    return std * gauss_markov(_normals(fleet, sensor, at, *size), fleet.dt / sensors.odometry_error_time)
 
 
 def gauss_markov(normals: Floats, steps: float) -> Floats:

@@ -73,7 +73,7 @@ class Sensors:
     speed_scale_std: float = 0.0
     """Of an error that lasts and is a share of the speed (tyre radius)."""
     velocity_bias_std: float = 0.0
-    """m/s, what a pose filter assumes of an error on each axis of a body velocity that lasts; it never acts."""
+    """m/s, of an error on each axis of a body velocity that lasts."""
     odometry_error_time: float = 1e6
     """s, correlation time of these three (Gauss-Markov); the default is one draw for a whole run."""
     min_range: float = 2.0

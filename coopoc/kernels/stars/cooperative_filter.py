@@ -114,6 +114,7 @@ from .otherwise import (
     LEAST_COUNTED,
     LIKELY,
     LOUDEST_NOISE,
+    MAY_SLIP,
     MOST_EXCESS,
     NOW,
     NUMBERS,
@@ -271,7 +272,7 @@ def step(
     fails = tries.doubts[PENDING] > 0.0
     if slips and surprised(f, fails or failure_known):
         other.ego[NOW] = 1.0
-        if other.ego[LEFT + 3] >= NOT_REMEMBERED_M2 or other.ego[SLIPPED] <= 0.1:
+        if other.ego[LEFT + 3] >= NOT_REMEMBERED_M2 or other.ego[SLIPPED] <= MAY_SLIP:
             remember_place(other, hidden(other, tries.own))
         if fails or failure_known:
             corrected_motion(other, tries.own, tries.own[MORE] if failure_known else tries.doubts[PENDING])
@@ -337,9 +338,8 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     trusted = f.status[f.who[0, VEHICLE], TRUSTED] > 0.0
     if f.who[0, REJECTED] == 0 and trusted:
         f.ego[AGREED] += own[DT]
-    elif (
-        f.ego[AGREED] < ESTABLISHED or not trusted
-    ):  # faster, so that a start of 10 s that was wrong is left 10 s later
+    elif f.ego[AGREED] < ESTABLISHED or not trusted:
+        # faster, so that a start of 10 s that was wrong is left 10 s later
         f.ego[AGREED] = max(min(f.ego[AGREED], ESTABLISHED) - 1.5 * own[DT], 0.0)
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]
@@ -444,7 +444,7 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
     for c in range(3):
         p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
         other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP_M2)
-        gain += p / (3.0 * (p + r)) if f.ego[NOW] == 0.0 else 0.0
+        gain += p / (3.0 * (p + r)) if f.ego[NOW] == 0.0 else 0.0  # what follows a slip confirms none
         apart += (g.x[c] - left[c] + p / (p + r) * h.three[GAP + c]) ** 2  # where this fix would put it
     gate = max(model.fix_gate, FIX_GATE)
     what, left[4], left[5] = remember(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])

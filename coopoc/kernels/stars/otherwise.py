@@ -282,6 +282,8 @@ SIDEWAYS, TURNS, LEFT_OPEN = 0.03, 0.3, 5.0
 largest variance of a slip over that of a motion which fixes correct."""
 SLIP_DURATION_S, SLIP_INTERVAL_S, SLIP_HIDDEN_S = 3.0, 3000.0, 1.0
 """Mean s of a slip and from one to the next; s until fixes show one."""
+MAY_SLIP = 0.1
+"""Probability from which the ego may be slipping."""
 
 
 class Tries(NamedTuple):
@@ -422,7 +424,7 @@ def surprised(f: Filter, fails: bool) -> bool:
     """Whether the first try's innovations are larger than usual by a standard deviation, or the ego may be slipping.
     Fixes that jumped do not count while odometry does not fail."""
     n = f.ego[NUMBERS]
-    strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
+    strange = f.ego[SLIPPED] > MAY_SLIP or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
     return strange and (f.ego[JUMPED] == 0.0 or fails)
 
 
