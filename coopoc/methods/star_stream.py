@@ -155,7 +155,7 @@ class StarStream:
         self._numbers, self._names = dict[str, int](), list[str]()
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._answer: Floats = np.full(12, np.nan)
-        self._memory: Floats = np.zeros(9)
+        self._memory: Floats = np.append(np.zeros(9), np.full(3, np.nan))
         self._odometry: Floats = new_state(self._motion) if priors.fix_gate else np.empty((0, 0))
         if x0 is not None:
             self._memory[:6] = *self._start, *np.full(3, 1.0 / START_VARIANCE)
@@ -168,7 +168,7 @@ class StarStream:
     @property
     def broadcast(self) -> Broadcast | None:
         """What this vehicle sends now; None before its first fix."""
-        mean, weight, odometer = self._memory.reshape(3, 3)
+        mean, weight, odometer = self._memory[:9].reshape(3, 3)
         if not weight.all():
             return None
         return Broadcast(mean.copy(), self._given[3:6].copy(), 1.0 / weight, odometer.copy())

@@ -171,6 +171,15 @@ class Life(NamedTuple):
     absent: Floats
 
 
+def fresh(gnss: Floats) -> Floats:
+    """Fixes (T, N, 3) but those that repeat the last one of their receiver."""
+    new, last = gnss.copy(), np.full(gnss.shape[1:], np.nan)
+    for now, fix in zip(new, gnss, strict=True):
+        now[(fix == last).all(axis=1)] = np.nan
+        last = np.where(np.isfinite(fix), fix, last)
+    return new
+
+
 class Oracle:
     """The filter of one ego in one run."""
 
@@ -181,7 +190,8 @@ class Oracle:
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
-        self.dt, self.fix, self.u = seen.dt, seen.gnss[run, :, ego], seen.velocity[run, :, ego]
+        gnss = fresh(seen.gnss[run])
+        self.dt, self.fix, self.u = seen.dt, gnss[:, ego], seen.velocity[run, :, ego]
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), np.zeros(3), 1, np.zeros(6)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
@@ -202,7 +212,7 @@ class Oracle:
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
         self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
-        self.remember(seen.gnss[run], seen.velocity[run])
+        self.remember(gnss, seen.velocity[run])
         self.lone: Any
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
         self.q = heard(seen, self.box, known, run, ego)

@@ -15,7 +15,7 @@ from ..compiling.small import apply, inner_product, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
-from .cooperative_messages import doubt_ego, fix_terms, goes_on, may_slip, receive, trust, use_fix
+from .cooperative_messages import doubt_ego, fix_terms, goes_on, may_slip, receive, take_fix, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -36,6 +36,7 @@ from .cooperative_state import (
     HITS,
     INPUT,
     JOINED,
+    LAST_FIX,
     LEFT,
     LEVEL,
     LOCKED,
@@ -171,6 +172,7 @@ def run_filter(
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f, tries = new_filter(most, vehicles), new_tries(most, vehicles)
+        own[LAST_FIX:] = math.nan
         for t in range(steps):
             count = gather(own, rows, who, measurements, assumed, sent, odometry, model.white, run, t)
             if f.g.vectors[0] == 0:
@@ -210,8 +212,9 @@ def gather(
     u, r = measurements.velocity[run, t, ego], three_of(assumed.fixes, run, t, ego)
     q, own[DT] = three_of(assumed.process, run, t, ego), dt
     for c in range(3):
-        own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, ego, c], r[c] * white[c]
+        own[FIX_VARIANCE + c] = r[c] * white[c]
         own[MOTION + c], own[MOTION_VARIANCE + c] = dt * u[c], q[c]
+    take_fix(measurements.gnss[run, t, ego], own[LAST_FIX:], own)
     for i in range(4):
         own[BY_FIXES + i] = odometry[run, t, i]
     measured_motion(own)

@@ -122,18 +122,29 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
     """
     runs, steps, vehicles = gnss.shape[:3]
     sent, memory, moved, r = np.zeros((vehicles, runs, steps, 9)), np.zeros(9), np.zeros(3), np.zeros(3)
+    fix, last = np.zeros(3), np.zeros(3)
     for j in range(vehicles):
         for run in range(runs):
-            memory[:] = 0.0
+            memory[:], last[:] = 0.0, math.nan
             for t in range(steps):
                 for c in range(3):
                     moved[c], r[c] = dt * velocity[run, t, j, c], three_of(variance, run, t, j)[c]
                 if math.isnan(moved[0]):
                     memory[3:6], moved[:] = 0.0, 0.0
-                remember(memory, moved, gnss[run, t, j], r, dt)
+                take_fix(gnss[run, t, j], last, fix)
+                remember(memory, moved, fix, r, dt)
                 for i in range(9):
                     sent[j, run, t, i] = 1.0 / max(memory[i], 1e-300) if i // 3 == 1 else memory[i]
     return sent
+
+
+@inside
+def take_fix(fix: Floats, last: Floats, out: Floats) -> None:
+    """Write a fix, m, and remember it; none where a receiver repeats its last one, to all digits."""
+    repeated = fix[0] == last[0] and fix[1] == last[1] and fix[2] == last[2]
+    for c in range(3):
+        out[c] = math.nan if repeated else fix[c]
+        last[c] = last[c] if math.isnan(fix[c]) else fix[c]
 
 
 @inside

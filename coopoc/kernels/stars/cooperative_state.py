@@ -33,9 +33,10 @@ from .gaussian import (
 )
 from .messages import vector_at
 
-FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, OWN = 0, 3, 6, 9, 12, 13, 16, 17
+FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, LAST_FIX, OWN = 0, 3, 6, 9, 12, 13, 16, 17, 20
 """Fields of the ego's row: fix m (NaN for none), its variance m^2, motion m and its variance m^2, three numbers each;
-dt s; the part m of the motion by which fixes have corrected it, and the variance m^2 that this adds."""
+dt s; the part m of the motion by which fixes have corrected it, and the variance m^2 that this adds; and, of a drive,
+the last fix m that there was."""
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Fields of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none), mean of its fixes m and
 its variance m^2, odometer (sum of all motions) m, velocity m/s, variance of one step's motion m^2 and of a fix m^2."""

@@ -14,7 +14,7 @@ from ..dead_reckoning import BAD_INPUT, ROUNDING, dead_reckon
 from ..gate import CONFIRMED
 from ..motion import MotionNoise, keep_pace, process_variance
 from .cooperative_filter import step
-from .cooperative_messages import remember
+from .cooperative_messages import remember, take_fix
 from .cooperative_state import (
     AGE,
     ANSWER,
@@ -75,13 +75,14 @@ def stream_rows(
         last: (vehicles, WIDTH) newest message of each, AGE the time when it was sent s, the square of its pace in STEP.
         time: s, of the step.
         max_age: s, of the oldest message that counts.
-        memory: of `remember`, of the ego.
+        memory: (12,) of `remember`, of the ego, and its last fix m.
     """
     since, late, dt = np.zeros(3), np.zeros(3), numbers[6]
     moved, q = own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT]
     outcome = dead_reckon(numbers, history, motion, fix, odometry, moved, q, since, late, own[BY_FIXES:OWN])
     if outcome == BAD_INPUT:
         return BAD_INPUT
+    take_fix(numbers, memory[9:], numbers)
     own[DT], interval = dt, motion.interval if motion.interval > 0.0 else dt
     for c in range(3):
         own[FIX + c], own[FIX_VARIANCE + c] = numbers[c] + since[c], fix[c] + late[c]
