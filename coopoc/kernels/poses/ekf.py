@@ -7,7 +7,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
-from ..odometry_fault import judge
+from ..odometry_fault import SIZE, judge
 from .odometry import PoseNoise, join, predict, symmetrise
 from .scalar_update import (
     ALONE,
@@ -74,6 +74,7 @@ def run_filter(
     options: PoseOptions,
     poses: Poses,
     pair: Poses,
+    faults: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """States (R, T, n, d), NaN where absent, their covariances (R, T, n, d, d), and cost and number of rows (R, 2).
 
@@ -86,13 +87,14 @@ def run_filter(
         options: of the filter.
         poses: memory for the members.
         pair: memory for two members.
+        faults: of `new_faults`.
     """
     (runs, steps, members, _), d = measured.own.shape, options.d
     x, cov = np.full((runs, steps, members, d), np.nan), np.full((runs, steps, members, d, d), np.nan)
     cost = np.zeros((runs, 2))
     for run in range(runs):
         for t in range(steps):
-            step(measured, noise, begin, spread, options, poses, pair, run, t)
+            step(measured, noise, begin, spread, options, poses, pair, faults, run, t)
             for k in range(members):
                 if measured.active[t, k]:
                     own = slice(d * k, d * k + d)
@@ -110,6 +112,7 @@ def step(
     options: PoseOptions,
     poses: Poses,
     pair: Poses,
+    faults: Floats,
     run: int,
     t: int,
 ) -> None:
@@ -120,9 +123,12 @@ def step(
     for k in range(measured.own.shape[2]):
         own, member = measured.own[run, t, k], d * k
         if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
-            predict(poses, member, d, own[4:7], own[7], measured.dt, noise)
+            predict(poses, faults[k], member, d, own[4:7], own[7], measured.dt, noise)
         elif measured.active[t, k]:
             join(poses, member, d, own, noise)
+            for pace in range(faults.shape[1]):
+                for i in range(SIZE):
+                    faults[k, pace, i] = faults[-1, pace, i]
             again = 0
             for s in range(t):
                 again += measured.active[s + 1, k] and not measured.active[s, k]
@@ -134,7 +140,7 @@ def step(
         own = measured.own[run, t, k]
         if measured.active[t, k] and not math.isnan(own[0]):
             if not math.isnan(own[3]):  # else it may be the heading that is wrong
-                lost = judge(poses.faults[k], own[0], own[1], 0.5 * (noise.fix[0] + noise.fix[1]), measured.dt)
+                lost = judge(faults[k], own[0], own[1], 0.5 * (noise.fix[0] + noise.fix[1]), measured.dt)
                 poses.cov[d * k, d * k] += lost
                 poses.cov[d * k + 1, d * k + 1] += lost
             update_fix(poses, d * k, own, noise.fix, noise.gate)

@@ -7,11 +7,10 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..compiling.vectors import LANES
 from ..gate import INITIAL_LOCKOUT
 from ..motion import MotionNoise, keep_pace, process_variance
-from ..odometry_fault import PACES, SIZE, correct, new_state
-from .scalar_update import HEADING, OFFSET, ROWS, SLOW, Poses, Three
+from ..odometry_fault import PACES, correct, new_state
+from .scalar_update import HEADING, OFFSET, SLOW, Poses, Three
 
 UNKNOWN_HEADING_RAD2 = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
@@ -46,18 +45,17 @@ class PoseNoise(NamedTuple):
     gate: float
 
 
-def new_poses(members: int, d: int, noise: PoseNoise, dt: float) -> Poses:
-    """Room for members of d numbers each; where a gate is open, their odometry is believed."""
-    size = -(-members * d // LANES) * LANES
-    (x, linear, prior_x, hits), (cov, prior_cov) = np.zeros((4, size)), np.zeros((2, size, size))
-    columns, gains = np.zeros((2, ROWS, size))
+def new_faults(members: int, noise: PoseNoise, dt: float) -> Floats:
+    """(members + 1, paces, SIZE) of `kernels.odometry_fault`, the last of which stays new; no paces where the gate is
+    open: odometry is believed. Beside `Poses`, which every row that is used hands on."""
     fresh = new_state(noise.odometer._replace(interval=dt))[: len(PACES) if math.isfinite(noise.gate) else 0]
-    weights, pace, faults = np.zeros(ROWS), np.zeros((3, size)), np.tile(fresh, (members + 1, 1, 1))
-    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, weights, hits, pace, faults, np.zeros(3))
+    return np.tile(fresh, (members + 1, 1, 1))
 
 
 @part
-def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt: float, noise: PoseNoise) -> None:
+def predict(
+    poses: Poses, fault: Floats, member: int, d: int, velocity: Floats, rate: float, dt: float, noise: PoseNoise
+) -> None:
     """Move one member by its odometry.
 
     th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) (u - e) / (1 + s), and P' = F P F^T + G Q G^T with the
@@ -65,6 +63,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
 
     Args:
         poses: the state.
+        fault: of `kernels.odometry_fault`.
         member: its first number.
         d: numbers of a member.
         velocity: u, forward, left and up m/s.
@@ -87,7 +86,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Floats, rate: float, dt
     east, north = cos * forward - sin * left, sin * forward + cos * left
     world = poses.pace[2, member : member + 3]
     world[0], world[1] = east / dt, north / dt
-    more = correct(poses.faults[member // d], world, dt)
+    more = correct(fault, world, dt)
     x[member] += dt * world[0]
     x[member + 1] += dt * world[1]
     x[member + 2] += up
@@ -164,9 +163,6 @@ def symmetrise(cov: Floats, member: int, d: int) -> None:
 def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> None:
     """Begin a member where its fix and compass place it, and know nothing of it yet."""
     poses.hits[member] = poses.hits[member + 1] = INITIAL_LOCKOUT
-    for i in range(poses.faults.shape[1]):
-        for j in range(SIZE):
-            poses.faults[member // d, i, j] = poses.faults[-1, i, j]
     for i in range(member, member + d):
         for j in range(len(poses.x)):
             poses.cov[i, j] = poses.cov[j, i] = 0.0

@@ -52,7 +52,6 @@ class Poses(NamedTuple):
         hits: (size,) of `coopoc.kernels.gate`: of fixes at a member's first number, of its other rows at the second.
         pace: (3, size) its square (m/s)^2 forward, left and up, at each member's first numbers, the variance of a
             velocity by it, and the velocity in the world.
-        faults: (n + 1, paces, SIZE) of `kernels.odometry_fault`, the last one new; no paces where odometry is believed.
         totals: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
@@ -66,11 +65,19 @@ class Poses(NamedTuple):
     weights: Floats
     hits: Floats
     pace: Floats
-    faults: Floats
     totals: Floats
 
 
 COST, USED, PENDING = range(3)
+
+
+def new_poses(numbers: int) -> Poses:
+    """Room for so many numbers."""
+    size = -(-numbers // LANES) * LANES
+    (x, linear, prior_x, hits), (cov, prior_cov) = np.zeros((4, size)), np.zeros((2, size, size))
+    columns, gains = np.zeros((2, ROWS, size))
+    weights, pace = np.zeros(ROWS), np.zeros((3, size))
+    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, weights, hits, pace, np.zeros(3))
 
 
 @part

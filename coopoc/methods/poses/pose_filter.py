@@ -253,16 +253,18 @@ class PoseFilter:
             landmark: position of what they measure.
         """
         from ...kernels.poses.ekf import run_filter
-        from ...kernels.poses.odometry import new_poses
+        from ...kernels.poses.odometry import new_faults
+        from ...kernels.poses.scalar_update import new_poses
 
         sensors, spread = self.assumed or recording.sensors, self._spread
         if self.spread is None and np.isfinite(recording.gnss[:, :, members]).any():
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
         noise, options = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
-        memory = (new_poses(count, options.d, noise, recording.dt) for count in (len(members), 2))
+        memory = (new_poses(count * options.d) for count in (len(members), 2))
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
-        return run_filter(measured, noise, first, spread, options, *memory)
+        faults = new_faults(len(members), noise, recording.dt)
+        return run_filter(measured, noise, first, spread, options, *memory, faults)
 
     def _settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
         """What it assumes, and its options, as the kernel takes them."""

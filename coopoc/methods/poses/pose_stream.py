@@ -95,11 +95,13 @@ class PoseStream:
     """
 
     def __init__(self, noise: "PoseNoise", options: "PoseOptions", begin: Floats, spread: Floats, dt: float) -> None:
-        from ...kernels.poses.odometry import new_poses
+        from ...kernels.poses.odometry import new_faults
+        from ...kernels.poses.scalar_update import new_poses
 
         self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
         self._begin, self._later, self._heading = begin[None, None, None], False, np.nan
-        self._poses, self._pair = (new_poses(count, options.d, noise, dt) for count in (1, 2))
+        self._poses, self._pair = (new_poses(count * options.d) for count in (1, 2))
+        self._faults = new_faults(1, noise, dt)
 
     def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
         """Pose of the ego now.
@@ -129,7 +131,8 @@ class PoseStream:
         first = np.array([0, 0, count] if t else [0, count, count])
         active = np.ones((2, 1), dtype=bool)
         measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt)
-        step(measured, self._noise, self._begin, self._spread, self._options, self._poses, self._pair, 0, t)
+        memory = self._poses, self._pair, self._faults
+        step(measured, self._noise, self._begin, self._spread, self._options, *memory, 0, t)
         self._later, d = True, self._options.d
         x = self._poses.x[:d].copy()
         x[3] = wrap(x[3])
