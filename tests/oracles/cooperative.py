@@ -171,11 +171,12 @@ class Life(NamedTuple):
     absent: Floats
 
 
-def fresh(gnss: Floats) -> Floats:
-    """Fixes (T, N, 3) but those that repeat the last one of their receiver."""
+def fresh(gnss: Floats, moved: Floats, variance: Floats) -> Floats:
+    """Fixes (T, N, 3) but those that repeat the last one of their receiver, whose vehicle has moved."""
     new, last = gnss.copy(), np.full(gnss.shape[1:], np.nan)
-    for now, fix in zip(new, gnss, strict=True):
-        now[(fix == last).all(axis=1)] = np.nan
+    moves = np.square(moved).sum(axis=-1) > 0.01 * variance[..., 0]
+    for now, fix, goes in zip(new, gnss, moves, strict=True):
+        now[goes & (fix == last).all(axis=1)] = np.nan
         last = np.where(np.isfinite(fix), fix, last)
     return new
 
@@ -190,8 +191,7 @@ class Oracle:
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
-        gnss = fresh(seen.gnss[run])
-        self.dt, self.fix, self.u = seen.dt, gnss[:, ego], seen.velocity[run, :, ego]
+        self.dt, self.u = seen.dt, seen.velocity[run, :, ego]
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), np.zeros(3), 1, np.zeros(6)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
@@ -212,6 +212,8 @@ class Oracle:
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
         self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
+        gnss = fresh(seen.gnss[run], seen.dt * seen.velocity[run], self.r)
+        self.fix = gnss[:, ego]
         self.remember(gnss, seen.velocity[run])
         self.lone: Any
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)

@@ -96,6 +96,8 @@ FAULTY_SHARE = 0.1
 """Prior share of vehicles whose receiver errs: of 0.05 to 0.3 no world is told apart."""
 TRUST_LOG_ODDS, PENALTY, REVOKE_LOG_ODDS = 2.0, 4.0, 2.0
 """Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
+MOVES = 0.01
+"""Share of the variance of a fix from which the square of a step's motion says that a vehicle does not stand."""
 WINDOW = 30.0
 """Fixes in the mean innovation of a vehicle."""
 
@@ -131,7 +133,7 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
                     moved[c], r[c] = dt * velocity[run, t, j, c], three_of(variance, run, t, j)[c]
                 if math.isnan(moved[0]):
                     memory[3:6], moved[:] = 0.0, 0.0
-                take_fix(gnss[run, t, j], last, fix)
+                take_fix(gnss[run, t, j], moved, r, last, fix)
                 remember(memory, moved, fix, r, dt)
                 for i in range(9):
                     sent[j, run, t, i] = 1.0 / max(memory[i], 1e-300) if i // 3 == 1 else memory[i]
@@ -139,9 +141,12 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
 
 
 @inside
-def take_fix(fix: Floats, last: Floats, out: Floats) -> None:
-    """Write a fix, m, and remember it; none where a receiver repeats its last one, to all digits."""
+def take_fix(fix: Floats, moved: Floats, variance: Floats, last: Floats, out: Floats) -> None:
+    """Write a fix, m, of a variance m^2 and remember it; none where a receiver repeats its last one to all digits
+    although the vehicle has moved, m."""
+    way = vector_at(moved, 0)
     repeated = fix[0] == last[0] and fix[1] == last[1] and fix[2] == last[2]
+    repeated = repeated and inner_product(way, way) > MOVES * variance[0]
     for c in range(3):
         out[c] = math.nan if repeated else fix[c]
         last[c] = last[c] if math.isnan(fix[c]) else fix[c]
