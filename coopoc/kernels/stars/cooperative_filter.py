@@ -214,7 +214,7 @@ def gather(
     for c in range(3):
         own[FIX_VARIANCE + c] = r[c] * white[c]
         own[MOTION + c], own[MOTION_VARIANCE + c] = dt * u[c], q[c]
-    take_fix(measurements.gnss[run, t, ego], own[MOTION:], r, own[LAST_FIX:], own)
+    take_fix(measurements.gnss[run, t, ego], own[MOTION:], r[0], own[LAST_FIX:], own)
     for i in range(4):
         own[BY_FIXES + i] = odometry[run, t, i]
     measured_motion(own)

@@ -133,7 +133,7 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
                     moved[c], r[c] = dt * velocity[run, t, j, c], three_of(variance, run, t, j)[c]
                 if math.isnan(moved[0]):
                     memory[3:6], moved[:] = 0.0, 0.0
-                take_fix(gnss[run, t, j], moved, r, last, fix)
+                take_fix(gnss[run, t, j], moved, r[0], last, fix)
                 remember(memory, moved, fix, r, dt)
                 for i in range(9):
                     sent[j, run, t, i] = 1.0 / max(memory[i], 1e-300) if i // 3 == 1 else memory[i]
@@ -141,12 +141,12 @@ def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -
 
 
 @inside
-def take_fix(fix: Floats, moved: Floats, variance: Floats, last: Floats, out: Floats) -> None:
+def take_fix(fix: Floats, moved: Floats, variance: float, last: Floats, out: Floats) -> None:
     """Write a fix, m, of a variance m^2 and remember it; none where a receiver repeats its last one to all digits
     although the vehicle has moved, m."""
     way = vector_at(moved, 0)
     repeated = fix[0] == last[0] and fix[1] == last[1] and fix[2] == last[2]
-    repeated = repeated and inner_product(way, way) > MOVES * variance[0]
+    repeated = repeated and inner_product(way, way) > MOVES * variance
     for c in range(3):
         out[c] = math.nan if repeated else fix[c]
         last[c] = last[c] if math.isnan(fix[c]) else fix[c]

@@ -82,7 +82,7 @@ def stream_rows(
     outcome = dead_reckon(numbers, history, motion, fix, odometry, moved, q, since, late, own[BY_FIXES:OWN])
     if outcome == BAD_INPUT:
         return BAD_INPUT
-    take_fix(numbers, moved, fix, memory[9:], numbers)
+    take_fix(numbers, moved, fix[0], memory[9:], numbers)
     own[DT], interval = dt, motion.interval if motion.interval > 0.0 else dt
     for c in range(3):
         own[FIX + c], own[FIX_VARIANCE + c] = numbers[c] + since[c], fix[c] + late[c]

@@ -261,10 +261,10 @@ class PoseFilter:
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
         noise, options = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
-        memory = (new_poses(count * options.d) for count in (len(members), 2))
+        poses, pair = new_poses(len(members) * options.d), new_poses(2 * options.d)
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         faults = new_faults(len(members), noise, recording.dt)
-        return run_filter(measured, noise, first, spread, options, *memory, faults)
+        return run_filter(measured, noise, first, spread, options, poses, pair, faults)
 
     def _settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
         """What it assumes, and its options, as the kernel takes them."""
