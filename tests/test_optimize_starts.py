@@ -95,8 +95,8 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
         problem = Problem("abcdefo"[:nodes]).add("position", range(many), fixes, std=std, loss=loss)
         pairs = np.c_[i, j, np.full(15, 6)]
         if case == "an offset":
-            problem = problem.add("position", [6], [[0, 0, 0]], std=[9.0, 1.0, 1.0])
-            problem = problem.add("range_offset", pairs, z + 3.0, std=0.2).add("range", (3, 4), z[12], std=0.2)
+            problem = problem.add("position", [6], [[0, 0, 0]], std=[90.0, 1.0, 1.0])
+            problem = problem.add("range_offset", pairs, z - 30.0, std=0.2).add("range", (3, 4), z[12], std=0.2)
         elif case == "inclinations":
             z = np.arccos(apart[:, 2] / np.linalg.norm(apart, axis=1)) + 0.01 * rng.normal(size=15)
             problem = problem.add("inclination", pairs[:, :2], z, std=0.01)

@@ -1,7 +1,7 @@
 """solve: a Problem and the name of a backend give a Solution, verified independently of the solver."""
 
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -120,7 +120,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     problem = started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
-    constraints, searching = problem.constraints, problem.x0 is None and not whole
+    constraints, searching, given = problem.constraints, problem.x0 is None and not whole, start
     if constraints:  # which the search for a start leaves to the solver
         problem = problem.replace_unchecked(constraints=())
     if searching:
@@ -132,9 +132,10 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     if constraints:
         problem = problem.replace_unchecked(constraints=constraints)
     result = backend.run(problem, start, options)
-    if searching and constraints:
-        problem, result = _drawn(problem, backend, options, result)
-    elif has_start and not constraints:
+    if constraints:
+        told = whole or (has_start and abs(problem.cost(given) - problem.cost(result.x)) <= RIVAL_COST)
+        problem, result = (problem, result) if told else _drawn(problem, backend, options, result, has_start)
+    elif has_start:
         problem, result = _challenged(problem, backend, options, result, whole)
     search = problem.search
     solved = clock()
@@ -182,10 +183,14 @@ def _searched(problem: Problem, start: Floats, end: Floats | None, draws: bool) 
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
-def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverResult) -> tuple[Problem, SolverResult]:
-    """The lowest feasible result of a problem with constraints, of the first and those from random places around it;
-    the problem's notes are of the minima that were found."""
+def _drawn(
+    problem: Problem, backend: Backend, options: Options, first: SolverResult, has_start: bool
+) -> tuple[Problem, SolverResult]:
+    """The lowest feasible result of a problem with constraints, of the first, those from random places around it, and
+    beside a given x0 that from where the measurements lead; the problem's notes are of the minima that were found."""
     few, steps, search = {**options, "max_iterations": DRAWN_STEPS}, 0, problem.search
+    free, around = problem.replace_unchecked(constraints=()), first.x
+    led = [around := np.asarray(_measured(free, first.x, True).x0)] if has_start else []
 
     def descend(x: Floats) -> Floats:
         nonlocal steps
@@ -196,7 +201,7 @@ def _drawn(problem: Problem, backend: Backend, options: Options, first: SolverRe
     def cost(x: Floats) -> float:
         return problem.cost(x) if constraint_rows(problem, x).outside.max() <= FEASIBLE else np.inf
 
-    x, ends = drawn(islice(scattered(problem, first.x), QUIET_DRAWS), first.x, descend, cost)
+    x, ends = drawn(chain(led, islice(scattered(problem, around), QUIET_DRAWS)), first.x, descend, cost)
     notes, start = doubts(x, ends, cost), search.start
     if x is not first.x:
         steps, start, first = steps + first.iterations, "drawn", backend.run(problem, x, options)
@@ -217,12 +222,8 @@ def _challenged(
     near = not np.isfinite(cost) or (straight and sure) or record[0, 0] - cost <= RIVAL_COST
     if near or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
-    if problem.poses:
-        other = started(problem, first.x)
-    else:
-        astray = np.abs(first.x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(first.x, axis=0).max()
-        draws = bool(not whole and (astray or not straight))
-        other = _searched(problem, converted(problem, first.x)[0], first.x, draws)
+    astray = np.abs(first.x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(first.x, axis=0).max()
+    other = _measured(problem, first.x, bool(not whole and (astray or not straight)))
     search, said, least = other.search, problem.search.notes, system.cost(np.asarray(other.x0))
     search = search._replace(iterations=search.iterations + first.iterations)
     if higher(cost, least):
@@ -231,6 +232,11 @@ def _challenged(
         return other, backend.run(other, np.asarray(other.x0), options)
     notes = reached_once([cost, least], cost) if higher(least, cost) else search.notes
     return problem.replace_unchecked(search=problem.search._replace(notes=(*said, *notes))), first
+
+
+def _measured(problem: Problem, end: Floats, draws: bool) -> Problem:
+    """A problem from where its measurements lead lowest, or from the end (n, ambient) of its x0."""
+    return started(problem, end) if problem.poses else _searched(problem, converted(problem, end)[0], end, draws)
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:

@@ -216,7 +216,7 @@ def speed(dx: Any, dy: Any, dz: Any, dt: Any, m: Any = np) -> Sequence[Any]:
     return (to_spherical(dx, dy, dz, m)[0] / dt,)
 
 
-@measurement("range_offset", arity=3, components=("distance",), frame="nodes", plane=(0,))
+@measurement("range_offset", arity=3, components=("coordinate",), frame="nodes", plane=(0,))
 def range_offset(a: Any, b: Any, offset: Any, m: Any = np) -> Sequence[Any]:
     """Distance between two nodes and the first coordinate of a third, an offset that ranges share: m."""
     x, y, z = (q - p for p, q in zip(a[:3], b[:3], strict=True))
