@@ -88,25 +88,24 @@ def moving(letter: str, t: Floats, position: Floats) -> Fleet:
     return Fleet(tuple(f"{letter}{i}" for i in range(position.shape[1])), t, position, velocity)
 
 
-def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) -> Fleet:
+def formation_fleet(vehicles: int = 11, steps: int = 901) -> Fleet:
     """Rigid formation within 30 m on a gently sinuous path at 10 m/s: ten on a ring (docs/decisions.md)."""
     t = np.arange(steps) * 0.1
     course = 0.3 * np.sin(2 * np.pi * t / 60)
     path = np.cumsum(np.c_[np.cos(course), np.sin(course), 0 * t], axis=0)
     around = np.linspace(0, 2 * np.pi, vehicles - 1, endpoint=False)
-    gap = np.linspace(ring, ring + 0.1, vehicles - 1)
+    gap = np.linspace(22.0, 22.1, vehicles - 1)
     offset = np.vstack([np.zeros(3), np.c_[gap * np.cos(around), gap * np.sin(around), 0 * gap]])
     position = path[:, None] + offset
     return moving("v", t, position)
 
 
-def crossing_fleet(vehicles: int = 8, steps: int = 60, seed: int = 3) -> Fleet:
+def crossing_fleet() -> Fleet:
     """Vehicles that cross a square of 60 m at their own heights and speeds: neighbours come and go, z matters."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(steps) * 0.1
-    start = rng.uniform(-30, 30, (vehicles, 3)) * [1, 1, 0.1]
-    speed = rng.normal(0, 6, (vehicles, 3)) * [1, 1, 0.05]
-    wobble = np.sin(t[:, None, None] + np.arange(vehicles)[:, None])
+    rng, t = np.random.default_rng(3), np.arange(60) * 0.1
+    start = rng.uniform(-30, 30, (8, 3)) * [1, 1, 0.1]
+    speed = rng.normal(0, 6, (8, 3)) * [1, 1, 0.05]
+    wobble = np.sin(t[:, None, None] + np.arange(8)[:, None])
     position = start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1]
     return moving("c", t, position)
 

@@ -1,5 +1,7 @@
 """Random factor graphs: robots that drive about with odometry, loops, landmarks and ranges, and stars."""
 
+from functools import partial
+
 import numpy as np
 from unseen_graphs import joined, world
 
@@ -34,7 +36,6 @@ def random_graph(
     seen: int = 40,
     turn_std: float = 0.01,
     step_std: float = 0.05,
-    range_std: float = 0.1,
     priors: bool = False,
 ) -> Graph:
     """Robots A, B, ... of `steps` poses 1 m apart within 40 m, whose vertices hold the truth.
@@ -53,9 +54,13 @@ def random_graph(
     return w.graph(
         relative_pose=poses,
         relative_point=w.seen(w.to_points(seen), 0.2) if seen and landmarks else PointEdges(),
-        ranges=w.ranged(np.concatenate(ranged), range_std) if ranges else RangeEdges(),
+        ranges=w.ranged(np.concatenate(ranged), 0.1) if ranges else RangeEdges(),
         point_prior=w.priors(0.1) if priors else PointEdges(),
     )
+
+
+random_drive = partial(random_graph, robots=1, landmarks=0, ranges=0)
+"""Odometry and loops of one robot."""
 
 
 def star(
@@ -64,10 +69,8 @@ def star(
     neighbours: int = 6,
     fix_std: float = 2.0,
     height: float = 0.2,
-    loss: Loss | None = None,
-    wrong: int = 0,
 ) -> Problem:
-    """An ego with ranges to, or azimuths of, its neighbours, the first `wrong` 40 m or rad too large, and fixes."""
+    """An ego with ranges to, or azimuths of, its neighbours, and fixes."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (neighbours, 3)) * [1, 1, height]])
     names = ("ego", *(f"v{j}" for j in range(1, neighbours + 1)))
@@ -75,5 +78,5 @@ def star(
     problem = Problem(names).add("position", names, fixes, std=fix_std)
     v, std = truth[1:], 0.5 if kind == "range" else 0.05
     z = np.linalg.norm(v, axis=1) if kind == "range" else np.arctan2(v[:, 1], v[:, 0])
-    z = z + rng.normal(0, std, neighbours) + 40.0 * (np.arange(neighbours) < wrong)
-    return problem.add(kind, [("ego", n) for n in names[1:]], z[:, None], std=std, loss=loss)
+    z = z + rng.normal(0, std, neighbours)
+    return problem.add(kind, [("ego", n) for n in names[1:]], z[:, None], std=std)

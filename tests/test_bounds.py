@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from conftest import coming_and_going, half_width, refused, standing
+from scipy.linalg import block_diag
 from test_pose_methods import convoy
 
 import coopoc as co
@@ -42,6 +43,10 @@ def test_solo_bound_tends_to_the_riccati_solution():
     )
 
 
+def node(vehicle: int, step: int) -> int:
+    return int(gtsam.symbol(chr(97 + vehicle), step))
+
+
 def point_marginals(
     fleet: Fleet, steps: int, v2x: V2X, observers: Any, seen: co.Recording | None = None
 ) -> gtsam.Marginals:
@@ -55,20 +60,20 @@ def point_marginals(
         mine = np.flatnonzero(links.step == t)
         members = {*np.flatnonzero(fleet.present[t]).tolist()} & {*observers, *links.neighbour[mine].tolist()}
         for m in members:
-            key, here = gtsam.symbol(chr(97 + m), t), fleet.position[t, m]
+            key, here = node(m, t), fleet.position[t, m]
             values.insert(key, here)
             if seen is None or np.isfinite(seen.gnss[0, t, m, 0]):
                 graph.add(gtsam.PriorFactorPoint3(key, here, sigmas(*S2.gnss_std)))
             if m in before:
                 gap, motion = here - fleet.position[t - 1, m], 0.1 * S2.velocity_std(fleet.velocity[t, m])
-                graph.add(gtsam.BetweenFactorPoint3(gtsam.symbol(chr(97 + m), t - 1), key, gap, sigmas(*motion)))
+                graph.add(gtsam.BetweenFactorPoint3(node(m, t - 1), key, gap, sigmas(*motion)))
         for link, i, j in zip(mine, links.observer[mine], links.neighbour[mine], strict=True):
             vector = fleet.position[t, j] - fleet.position[t, i]
             std = (
                 S2.relative_std if seen is None else np.where(np.isnan(seen.relative[0, link]), UNSEEN, S2.relative_std)
             )
             noise = gtsam.noiseModel.Gaussian.Covariance(vector_cov(np.array(spherical(*vector)), std))
-            ends = gtsam.symbol(chr(97 + i), t), gtsam.symbol(chr(97 + j), t)
+            ends = node(i, t), node(j, t)
             graph.add(gtsam.BetweenFactorPoint3(*ends, vector, noise))
         before = members
     return gtsam.Marginals(graph, values)
@@ -85,11 +90,11 @@ def test_bounds_equal_gtsam_marginals(neighbours, everyone, crossing):
     else:
         filtering, smoothing = (posterior_bound(fleet, S2, ego, v2x, smoothing=s) for s in (False, True))
     for t in (1, 17, 27):
-        expected = point_marginals(fleet, t + 1, v2x, who).marginalCovariance(gtsam.symbol(chr(97 + ego), t))
+        expected = point_marginals(fleet, t + 1, v2x, who).marginalCovariance(node(ego, t))
         assert filtering[t] == pytest.approx(expected, rel=1e-6, abs=1e-9)
     whole = point_marginals(fleet, len(fleet.t), v2x, who)
     for t in (0, 13, 29):
-        expected = whole.marginalCovariance(gtsam.symbol(chr(97 + ego), t))
+        expected = whole.marginalCovariance(node(ego, t))
         assert smoothing[t] == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
@@ -118,7 +123,7 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(nei
     one, smooth = (bound(told.of_runs(slice(0, 1)), smoothing) for smoothing in (False, True))
     for t in (3, 17, 41):
         for found, end in ((one, t + 1), (smooth, len(crossing.t))):
-            expected = point_marginals(crossing, end, v2x, who, told).marginalCovariance(gtsam.symbol("a", t))
+            expected = point_marginals(crossing, end, v2x, who, told).marginalCovariance(node(0, t))
             assert found[t] == pytest.approx(expected, rel=1e-3, abs=1e-6)
     mean = (one + bound(told.of_runs(slice(1, 2)))) / 2
     assert bound(told) == pytest.approx(mean, rel=1e-12)
@@ -185,7 +190,7 @@ def pose_marginals(fleet: co.Fleet, steps: int, sensors: co.Sensors) -> Any:
             k: gtsam.Pose2(*fleet.position[t, k, :2], heading[t, k]) for k in range(len(fleet.ids)) if k not in marks
         }
         for k, pose in now.items():
-            key = gtsam.symbol(chr(97 + k), t)
+            key = node(k, t)
             values.insert(key, pose)
             graph.add(gtsam.PoseTranslationPrior2D(key, pose, sigmas(*sensors.gnss_std[:2])))
             if sensors.compass:
@@ -195,21 +200,19 @@ def pose_marginals(fleet: co.Fleet, steps: int, sensors: co.Sensors) -> Any:
                 c, s = np.cos(middle[t, k]), np.sin(middle[t, k])
                 effect = dt * np.array([[c, -s, -moved[1] / 2], [s, c, moved[0] / 2], [0, 0, 1]])
                 cov = effect @ np.diag(np.square([*std, sensors.yaw_rate_std])) @ effect.T
-                world = np.eye(3)
-                world[:2, :2] = pose.rotation().matrix()
+                world = block_diag(pose.rotation().matrix(), 1.0)
                 noise = gtsam.noiseModel.Gaussian.Covariance(world.T @ cov @ world)
-                old = gtsam.symbol(chr(97 + k), t - 1)
-                graph.add(gtsam.BetweenFactorPose2(old, key, before[k].between(pose), noise))
+                graph.add(gtsam.BetweenFactorPose2(node(k, t - 1), key, before[k].between(pose), noise))
             else:  # a new member's heading lies within a turn
                 graph.add(gtsam.PoseRotationPrior2D(key, pose, sigmas(np.pi / 3**0.5)))
         for i, j in zip(links.observer[mine], links.neighbour[mine], strict=True):
-            vector, own = fleet.position[t, j] - fleet.position[t, i], gtsam.symbol(chr(97 + i), t)
+            vector, own = fleet.position[t, j] - fleet.position[t, i], node(i, t)
             range_, azimuth, _ = spherical(*vector)
             seen = gtsam.Rot2(azimuth - heading[t, i]), range_, sigmas(sensors.azimuth_std, sensors.range_std)
             if j in marks:
                 graph.add(gtsam.BearingRangeFactor2D(own, gtsam.symbol("m", j), *seen))
             else:
-                graph.add(gtsam.BearingRangeFactorPose2(own, gtsam.symbol(chr(97 + j), t), *seen))
+                graph.add(gtsam.BearingRangeFactorPose2(own, node(j, t), *seen))
         before = now
     return gtsam.Marginals(graph, values)
 
@@ -223,10 +226,8 @@ def test_pose_bounds_equal_gtsam_marginals(masts, compass):
     marks = [name for name in fleet.ids if name[0] == "m"]
     found = co.pose_bound(flat, sensors, NEAR, landmarks=marks)[:, 0]
     for t in (0, 5, 15):
-        marginal = pose_marginals(flat, t + 1, sensors).marginalCovariance(gtsam.symbol("a", t))
-        world = np.eye(3)
-        h = true_heading(flat)[t, 0]
-        world[:2, :2] = [[np.cos(h), -np.sin(h)], [np.sin(h), np.cos(h)]]
+        marginal = pose_marginals(flat, t + 1, sensors).marginalCovariance(node(0, t))
+        world = block_diag(gtsam.Rot2(true_heading(flat)[t, 0]).matrix(), 1.0)
         own = found[t][np.ix_([0, 1, 3], [0, 1, 3])]
         assert own == pytest.approx(world @ marginal @ world.T, rel=1e-6, abs=1e-9)
 

@@ -31,9 +31,9 @@ STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.8\n" for k in ran
 RANGES = "t,vehicle,partner,range\n0,tag,anchor,4.2\n1,tag,anchor,4.4\n"
 
 
-def swap(old: str, new: str, text: str = GOOD, count: int = 1) -> str:
+def swap(old: str, new: str, text: str = GOOD) -> str:
     assert old in text
-    return text.replace(old, new, count)
+    return text.replace(old, new, 1)
 
 
 def nanoseconds(text: str) -> str:

@@ -3,11 +3,11 @@
 import importlib
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime, timedelta
+from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -159,7 +159,7 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):
     """A pose of another program beside fixes in degrees; a simulator's truth by Odometry, whose heading counts."""
     pytest.importorskip("rosbags")
     fleet, path = drive(2, steps=80, start=1.7e9), tmp_path / "drive"
-    write_bag(path, fleet, 2, names={"truth": "pose"})
+    write_bag(path, fleet, 2, truth="pose")
     with refused("topics of a bag"):
         read_log(path, dt=0.1)
     without = read_log(path, dt=0.1, ignore=["/car0/pose"])
@@ -223,91 +223,66 @@ def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):
     assert by_header.summary.refused["fixes that the receiver calls invalid"][0] == 1
 
 
-def write_bag(
-    path: Path,
-    fleet: co.Fleet,
-    ros: int,
-    names: Mapping[str, str] = MappingProxyType({}),
-    late: float = 0.0,
-    invalid: int = -1,
-):
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
+ALL = {"fix": "sensor_msgs/NavSatFix", "odom": "nav_msgs/Odometry", "imu": "sensor_msgs/Imu"}
+FIRST = ALL | {"truth": "geometry_msgs/PoseStamped", "note": "std_msgs/String"}
+"""Topic -> type of all vehicles, and of the first."""
+
+
+def write_bag(path: Path, fleet: co.Fleet, ros: int, truth: str = "truth", late: float = 0.0, invalid: int = -1):
+    from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-    kind = store.types
-    time_type = kind["builtin_interfaces/msg/Time"]
 
-    def header(t):
-        stamp = time_type(int(t), round((t - int(t)) * 1e9))
-        words = {"stamp": stamp, "frame_id": "map", **({"seq": 0} if ros == 1 else {})}
-        return kind["std_msgs/msg/Header"](**words)
+    def of(kind: str, *values: Any) -> Any:
+        return store.types[kind.replace("/", "/msg/")](*values)
 
-    def vector(x, y, z):
-        return kind["geometry_msgs/msg/Vector3"](x, y, z)
+    def at(x: float, y: float = 0.0, z: float = 0.0, kind: str = "Vector3") -> Any:
+        return of(f"geometry_msgs/{kind}", float(x), float(y), float(z))
 
-    point, turned = kind["geometry_msgs/msg/Point"], kind["geometry_msgs/msg/Quaternion"]
-    writer: Any = Writer1(path) if ros == 1 else Writer2(path, version=9)
-    topic, names = (
-        names,
-        {
-            "fix": "sensor_msgs/msg/NavSatFix",
-            "odom": "nav_msgs/msg/Odometry",
-            "imu": "sensor_msgs/msg/Imu",
-            "truth": "geometry_msgs/msg/PoseStamped",
-            "note": "std_msgs/msg/String",
-        },
-    )
+    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+    writer: Any = rosbag1.Writer(path) if ros == 1 else rosbag2.Writer(path, version=9)
     with writer:
-        topics = {
-            (column, what): writer.add_connection(f"/{one}/{topic.get(what, what)}", name, typestore=store)
-            for column, one in enumerate(fleet.ids)
-            for what, name in names.items()
-            if what in ("fix", "odom", "imu") or column == 0
-        }
-        for step, t in enumerate(fleet.t):
-            for column in range(len(fleet.ids)):
-                x, u = fleet.position[step, column], fleet.velocity[step, column]
-                lat, lon, h = pymap3d.enu2geodetic(*x, 48.14, 11.58, 560.0)
-                yaw = float(np.arctan2(u[1], u[0]))
-                quaternion = turned(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
-                status = kind["sensor_msgs/msg/NavSatStatus"](-1 if step == invalid else 0, 1)
-                pose = kind["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turned(0.0, 0.0, 0.0, 1.0))
-                twist = kind["geometry_msgs/msg/Twist"](
-                    vector(float(np.hypot(*u[:2])), 0.0, 0.0), vector(0.0, 0.0, 0.0)
-                )
-                flat = np.zeros(36)
-                flat[0] = 0.01
-                messages = {
-                    "fix": kind[names["fix"]](
-                        header(t), status, lat, lon, h, np.diag([0.25, 0.36, 4.0]).ravel(), 2 - 2 * column
+        topics = {}
+        for column, one in enumerate(fleet.ids):
+            for what, kind in (ALL if column else FIRST).items():
+                name, type_ = f"/{one}/{truth if what == 'truth' else what}", kind.replace("/", "/msg/")
+                topics[column, what] = writer.add_connection(name, type_, typestore=store)
+        for (step, t), ((column, what), topic) in product(enumerate(fleet.t), topics.items()):
+            x, u = fleet.position[step, column], fleet.velocity[step, column]
+            stamp = of("builtin_interfaces/Time", int(t), round((t - int(t)) * 1e9))
+            yaw, speed, unknown = float(np.arctan2(u[1], u[0])), np.hypot(*u[:2]), np.zeros(36)
+            turned = of("geometry_msgs/Quaternion", 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+            upright = of("geometry_msgs/Pose", at(0, kind="Point"), of("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0))
+            values: dict[str, list[Any]] = {
+                "fix": [
+                    of("sensor_msgs/NavSatStatus", -int(step == invalid), 1),
+                    *pymap3d.enu2geodetic(*x, 48.14, 11.58, 560.0),
+                    np.diag([0.25, 0.36, 4.0]).ravel(),
+                    2 - 2 * column,
+                ],
+                "odom": [
+                    "base",
+                    of("geometry_msgs/PoseWithCovariance", upright, unknown),
+                    of(
+                        "geometry_msgs/TwistWithCovariance",
+                        of("geometry_msgs/Twist", at(speed), at(0)),
+                        0.01 * np.eye(1, 36)[0],
                     ),
-                    "odom": kind[names["odom"]](
-                        header(t),
-                        "base",
-                        kind["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
-                        kind["geometry_msgs/msg/TwistWithCovariance"](twist, flat),
-                    ),
-                    "imu": kind[names["imu"]](
-                        header(t),
-                        quaternion,
-                        np.diag([0.01, 0.01, 0.01]).ravel(),
-                        vector(0.0, 0.0, 0.06 * float(np.cos(0.15 * (t - fleet.t[0])))),
-                        np.zeros(9),
-                        vector(0.0, 0.0, 9.8),
-                        np.zeros(9),
-                    ),
-                }
-                if column == 0:
-                    messages["truth"] = kind[names["truth"]](
-                        header(t), kind["geometry_msgs/msg/Pose"](point(*x.tolist()), quaternion)
-                    )
-                    messages["note"] = kind[names["note"]]("hello")
-                for what, message in messages.items():
-                    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
-                    raw = serialize(message, names[what])
-                    writer.write(topics[column, what], round((t + late) * 1e9), raw)
+                ],
+                "imu": [
+                    turned,
+                    0.01 * np.eye(3).ravel(),
+                    at(0, 0, 0.06 * np.cos(0.15 * (t - fleet.t[0]))),
+                    unknown[:9],
+                    at(0, 0, 9.8),
+                    unknown[:9],
+                ],
+                "truth": [of("geometry_msgs/Pose", at(*x, kind="Point"), turned)],
+            }
+            head = of("std_msgs/Header", *[0] * (ros == 1), stamp, "map")
+            message = of(FIRST[what], head, *values[what]) if what in values else of(FIRST[what], "hello")
+            writer.write(topic, round((t + late) * 1e9), serialize(message, FIRST[what].replace("/", "/msg/")))
 
 
 def test_what_is_no_bag_is_named(tmp_path):

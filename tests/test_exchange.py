@@ -29,9 +29,9 @@ def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_r
     return Links(*columns)
 
 
-def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float, min_range: float = 2.0) -> int:
-    found = sensing.find_links(fleet, observers, V2X(max_neighbours=most, radius=radius), min_range)
-    wanted = by_brute_force(fleet, observers, most, radius, min_range)
+def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float) -> int:
+    found = sensing.find_links(fleet, observers, V2X(max_neighbours=most, radius=radius), 2.0)
+    wanted = by_brute_force(fleet, observers, most, radius, 2.0)
     for name in SIDES:
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
     return len(found)

@@ -213,16 +213,7 @@ def test_a_graph_cannot_be_changed_and_lists_its_robots():
 
 def test_rotations_are_scipys():
     q = np.random.default_rng(0).normal(size=(500, 4))
-    q[:8] = [
-        [0, 0, 0, 1],
-        [1, 0, 0, 0],
-        [0, 1, 0, 0],
-        [0, 0, 1, 0],
-        [0, 0, 0, -1],
-        [1, 1, 0, 0],
-        [0, 1, 1, 0],
-        [1, 0, 0, 1e-9],
-    ]
+    q[:8] = [*np.eye(4), [0, 0, 0, -1], [1, 1, 0, 0], [0, 1, 1, 0], [1, 0, 0, 1e-9]]
     turned = Rotation.from_quat(q)
     assert_allclose(to_rotation(q), turned.as_matrix(), atol=1e-14)
     assert_allclose(Rotation.from_quat(to_orientation(turned.as_matrix())).as_matrix(), turned.as_matrix(), atol=1e-14)

@@ -16,11 +16,11 @@ from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
 from coopoc.optimize.robust import graduated
 
 
-def paper_rho(r: float, mu: float, c: float = 1.0) -> float:
-    """The surrogate as Yang et al. print it, equation 6."""
-    if r**2 <= mu / (mu + 1) * c**2:
+def paper_rho(r: float, mu: float) -> float:
+    """The surrogate as Yang et al. print it, equation 6, with c = 1."""
+    if r**2 <= mu / (mu + 1):
         return r**2
-    return c**2 if r**2 >= (mu + 1) / mu * c**2 else 2 * c * r * np.sqrt(mu * (mu + 1)) - mu * (c**2 + r**2)
+    return 1.0 if r**2 >= (mu + 1) / mu else 2 * r * np.sqrt(mu * (mu + 1)) - mu * (1 + r**2)
 
 
 @pytest.mark.parametrize("mu", [0.05, 1.0, 7.0, 300.0])

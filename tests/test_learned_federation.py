@@ -257,17 +257,7 @@ def replies(weights: Tensor, sizes: Tensor) -> list[Any]:
         return RecordDict({"arrays": arrays, "metrics": MetricRecord({"num-examples": count})})
 
     def about(node):
-        return Metadata(
-            run_id=1,
-            message_id="",
-            src_node_id=node,
-            dst_node_id=99,
-            reply_to_message_id="",
-            group_id="",
-            created_at=0.0,
-            ttl=60.0,
-            message_type="train",
-        )
+        return Metadata(1, "", node, 99, "", "", 0.0, 60.0, "train")
 
     build: Any = Message
     return [

@@ -76,12 +76,11 @@ def alive(word: str) -> list[str]:
     return found
 
 
-def until(true: Callable[[], bool], seconds: float = 300, alive: "subprocess.Popen[bytes] | None" = None):
-    """Wait for something that a process, if one is named, must live to do."""
+def until(true: Callable[[], bool], seconds: float = 300):
+    """Wait for something."""
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end
-        assert alive is None or alive.poll() is None
         time.sleep(0.1)
 
 

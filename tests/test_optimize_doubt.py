@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import refused
-from random_graphs import PAIR, random_graph, torn
+from random_graphs import PAIR, random_drive, torn
 from scipy.stats import chi2
 
 import coopoc as co
@@ -78,7 +78,7 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
 @pytest.mark.parametrize("seed", [7, 13, 20])
 def test_a_race_ends_as_low_as_the_best_of_all_starts(seed):
     """Odometry that turns by 0.6 rad a step: some starts, of 13 and 20 all but the truth, wind cycles up."""
-    graph = random_graph(seed, robots=1, steps=40, landmarks=0, ranges=0, seen=0, loops=4, turn_std=0.6)
+    graph = random_drive(seed, steps=40, loops=4, turn_std=0.6)
     costs = [solve(from_graph(graph, start=start), throw=False).cost for start in ("odometry", "file", "tree")]
     assert max(costs) > 1.01 * min(costs)
     lost = replace(graph, position=np.full_like(graph.position, np.nan))
@@ -89,7 +89,7 @@ def test_a_race_ends_as_low_as_the_best_of_all_starts(seed):
 
 def test_covariances_of_many_nodes_are_computed_where_asked():
     """Also without them a free node is named, and the time that is printed is what was waited."""
-    graph = random_graph(5, robots=1, steps=1100, landmarks=0, ranges=0, seen=0, loops=20)
+    graph = random_drive(5, steps=1100, loops=20)
     problem = from_graph(graph)
     plain, full = solve(problem), solve(problem, covariance=True)
     assert np.isnan(plain.covariance).all()

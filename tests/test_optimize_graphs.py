@@ -11,7 +11,7 @@ import pytest
 from conftest import measured, refused
 from hard_graphs import cropped
 from oracles.bayes_tree import bayes_tree_marginals
-from random_graphs import moved, random_graph
+from random_graphs import moved, random_drive, random_graph
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 from unseen_graphs import drone, range_aided, world
@@ -246,10 +246,9 @@ def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated
 
 def test_ranges_of_zero_and_ends_in_one_place_are_taken():
     """|v|^2 has a derivative at v = 0; a range whose ends coincide at the start has a direction after a nudge."""
-    graph = random_graph(211, robots=1, steps=70, landmarks=0, ranges=0, seen=0, loops=20)
+    graph = random_drive(211, steps=70, loops=20)
     a, b, c = 3, 40, 60
-    x0 = from_graph(graph, start="odometry").x0
-    x0 = np.array(x0)
+    x0 = np.array(from_graph(graph, start="odometry").x0)
     ranges = RangeEdges([[a, b], [b, c]], [0.0, 2.0], [0.01, 0.01])
     together = replace(graph, ranges=ranges, relative_pose=PoseEdges())
     problem = from_graph(replace(graph, ranges=ranges))
@@ -267,7 +266,7 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken():
 
 
 def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():
-    graph = random_graph(212, robots=3, steps=40, landmarks=0, ranges=0, seen=0, loops=0)
+    graph = random_drive(212, robots=3, steps=40, loops=0)
     found = solve(from_graph(graph))
     assert from_graph(graph).fixed == (0, 40, 80)
     assert found.status is Status.SOLVED
@@ -288,7 +287,7 @@ def test_fixed_vertices_stay_where_the_file_has_them(start):
 def test_where_gtsams_optimizer_does_not_arrive_it_is_said():
     """Lengths in micrometres: GTSAM's least damping is one of the unit metre, and its Levenberg-Marquardt creeps.
     Referee: the minimum, which does not depend on the unit."""
-    graph = random_graph(216, robots=1, steps=40, landmarks=0, ranges=0, seen=0, loops=12)
+    graph = random_drive(216, steps=40, loops=12)
     edges, scale = graph.relative_pose, np.array([1e6, 1e6, 1.0])
     small = replace(edges, position=1e6 * edges.position, covariance=edges.covariance * scale[:, None] * scale)
     problem = from_graph(replace(graph, position=1e6 * graph.position, relative_pose=small), "geodesic", "odometry")
@@ -316,7 +315,7 @@ def test_a_measurement_without_variance_is_named(objective):
 def test_a_weak_measurement_is_no_free_node(weight):
     """Two halves of a chain whose link has standard deviations 1 / weight as large: observed, however weakly; without
     the link the second half is free."""
-    graph = random_graph(213, robots=1, steps=100, landmarks=0, ranges=0, seen=0, loops=0)
+    graph = random_drive(213, steps=100, loops=0)
     edges = graph.relative_pose
     covariance = np.array(edges.covariance)
     covariance[49] /= weight**2
@@ -338,7 +337,7 @@ def test_a_weak_measurement_is_no_free_node(weight):
 def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps, unseen):
     """Beside a chain with loops stand landmarks without a measurement: they are free, and harm neither the minimum nor
     the number of steps. Referee: the same graph without them."""
-    graph = random_graph(218, robots=1, steps=steps, landmarks=unseen, ranges=0, seen=0, loops=20)
+    graph = random_drive(218, steps=steps, landmarks=unseen, seen=0, loops=20)
     alone = solve(from_graph(cropped(graph, 1.0)))
     found = solve(from_graph(graph), throw=False)
     assert found.status is Status.RANK_DEFICIENT
@@ -352,7 +351,7 @@ def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension):
     """Closed form: half a chi-square, whose angles count twice in the plane; mean and spread over 40 graphs."""
     found, known = [], (0.0, 0.0)
     for seed in range(40):
-        graph = random_graph(seed, dimension, robots=1, landmarks=0, ranges=0, seen=0, loops=40)
+        graph = random_drive(seed, dimension, loops=40)
         problem = from_graph(graph, start="file")
         found.append(solve(problem, throw=False).cost)
         free = len(problem.names) - len(problem.fixed)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_graphs import random_graph
+from random_graphs import random_drive
 from scipy.optimize import least_squares
 from unseen_graphs import lost, ranged_drives, world
 
@@ -169,7 +169,7 @@ def test_rejecting_a_quarter_is_doubtful():
 
 def test_a_loss_rejects_what_least_squares_need_not():
     """No loop is beyond 2 where all count, but without one of them the cost is 7.23, not 8.36."""
-    problem = from_graph(random_graph(42, 2, 1, 15, landmarks=0, loops=8, ranges=0, seen=0), "geodesic")
+    problem = from_graph(random_drive(42, steps=15, loops=8), "geodesic")
     (every,), [(_, loops)] = problem.factors, loop_closures(problem)
     odometry, closing = (taken(every, rows) for rows in (np.setdiff1d(np.arange(len(every.nodes)), loops), loops))
     found = solve(replace(problem, factors=(odometry, replace(closing, loss=Loss("truncated", 2.0)))))
@@ -238,7 +238,7 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
 @pytest.mark.parametrize(("d", "seed"), [(2, 315), (3, 303)])
 def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, backend):
     """Costs that noise may explain lead from there, 49 for 25 and 34 for 21: without a note before."""
-    graph = random_graph(seed, d, 1, loops=8, landmarks=0, ranges=0, seen=0, turn_std=0.3)
+    graph = random_drive(seed, d, loops=8, turn_std=0.3)
     rng = np.random.default_rng(0)
     truth = from_graph(graph, "geodesic", start="file")
     far = truth.space.retract(truth.x0, 2 * rng.normal(size=truth.movable.shape) * truth.movable)

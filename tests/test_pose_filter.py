@@ -28,9 +28,9 @@ NOISE = co.Sensors(
 LATE = co.V2X(max_neighbours=3, radius=40.0, rate=5.0, loss=0.3, latency=0.2)
 
 
-def with_gaps(recording: co.Recording, seed: int = 0) -> co.Recording:
+def with_gaps(recording: co.Recording) -> co.Recording:
     """A third of the fixes and compasses after the first step, and of each relative component, are missing."""
-    rng, body = np.random.default_rng(seed), recording.body
+    rng, body = np.random.default_rng(0), recording.body
     gnss, heading, relative = recording.gnss.copy(), body.heading.copy(), recording.relative.copy()
     moving = ~np.isin(np.arange(len(recording.ids)), recording.landmarks)
     for values in (gnss, heading):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial as partial_of
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from conftest import holed, slow_fixes, standing, textbook, without
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
+from scipy.linalg import block_diag
 
 from coopoc import (
     LKFSA,
@@ -32,7 +34,7 @@ from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
 from coopoc.methods.track import Method
-from coopoc.world.links import spherical, to_vector, vector_cov
+from coopoc.world.links import spherical, to_vector
 
 S2 = Sensors.paper_scenario2()
 CHANNELS = {
@@ -66,12 +68,12 @@ def known_of(method: Any, recording: Recording) -> NoiseModel:
 
 def by_joint(method: JointFilter, recording: Recording, stars: Any) -> Any:
     known = known_of(method, recording)
-    return joint.follow(stars, known, method.exact and known.exact_relative)
+    exact = method.exact and known.exact_relative
+    return joint.follow(stars, partial_of(joint.update, noise_model=known, exact=exact))
 
 
 def by_lkf(method: LKFSA, recording: Recording, stars: Any) -> Any:
-    x, variance, others = lkf_sa.follow(stars, known_of(method, recording))
-    return x, variance[..., None] * np.eye(3), others
+    return joint.follow(stars, partial_of(lkf_sa.update, noise_model=known_of(method, recording)))
 
 
 def by_msmv(method: MSMV, recording: Recording, stars: Any) -> Any:
@@ -171,76 +173,42 @@ def test_a_state_without_process_noise_stays_finite(crossing):
     assert np.abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < np.abs(mean - still.position[-1, 1]).mean() + 0.5
 
 
-def star_of_four(formation: Fleet) -> tuple[Recording, NoiseModel]:
+@pytest.mark.parametrize("laplacian", [False, True])
+def test_linear_filters_equal_filterpy(formation, laplacian):
+    """The joint filter, and LKF-SA: the stacked star of a formation that never changes, from its first estimate on, in
+    which filterpy's own update would lose seven digits to the flat prior."""
     recording = observe(formation.select(range(4)).between(0, 40), S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    return recording, NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-
-
-def begin(peer: KalmanFilter, z: np.ndarray, noise: np.ndarray, at: np.ndarray):
-    """The first update, in which filterpy's own would lose seven digits to the flat prior."""
-    weight = peer.H.T @ np.linalg.inv(noise)
-    peer.P = np.linalg.inv(np.eye(len(at)) / 1e6 + weight @ peer.H)
-    peer.x = at + peer.P @ weight @ (z - peer.H @ at)
-
-
-def test_the_linear_filter_equals_filterpy(formation):
-    """Independent check over the stacked star of a formation that never changes, from its first estimate on."""
-    recording, known = star_of_four(formation)
-    track = textbook(JointFilter(known, exact=False))(recording, [0])
-    n, order = 12, [0, *recording.links.neighbour[:3]]
-    peer = KalmanFilter(dim_x=n, dim_z=n + 9, dim_u=n)
-    vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
-    peer.B, peer.H = 0.1 * np.eye(n), np.vstack([np.eye(n), vectors])
-    peer.Q = np.kron(np.eye(4), np.diag(np.square(known.process_std)))
-    where = to_vector(recording.relative[0])
-    noise = np.zeros((n + 9, n + 9))
-    noise[:n, :n] = np.kron(np.eye(4), np.diag(known.gnss_variance))
-    for t in range(40):
-        z = np.concatenate([recording.gnss[0, t, order].ravel(), where[3 * t : 3 * t + 3].ravel()])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = (LKFSA(known) if laplacian else textbook(JointFilter(known, exact=False)))(recording, [0])
+    order, edges = [0, *recording.links.neighbour[:3]], np.hstack([-np.ones((3, 1)), np.eye(3)])
+    rows = np.kron(edges.T @ edges if laplacian else edges, np.eye(3))
+    peer, n = KalmanFilter(dim_x=12, dim_z=12 + len(rows), dim_u=12), np.eye(12)
+    peer.B, peer.H, peer.Q = 0.1 * n, np.vstack([n, rows]), np.diag(np.square(known.process_std * 4))
+    for t, seen in enumerate(recording.relative[1].reshape(40, 3, 3)):
+        vectors = to_vector(seen)
         if t:
-            peer.predict(u=recording.velocity[0, t, order].ravel())
+            peer.predict(u=recording.velocity[1, t, order].ravel())
             ahead = peer.x[3:].reshape(3, 3) - peer.x[:3]
         else:
-            ahead = where[:3]
-        for k in range(3):
-            at = slice(n + 3 * k, n + 3 * k + 3)
-            noise[at, at] = known.relative_cov(np.array(spherical(*ahead[k])))
+            ahead = vectors
+        cov = known.relative_cov(seen if laplacian else np.array([spherical(*vector) for vector in ahead]))
+        cov = [np.trace(cov.mean(axis=0)) / 3 * np.diag(np.diag(rows))] if laplacian else cov
+        noise = block_diag(np.diag([*known.gnss_variance] * 4), *cov)
+        fixes = recording.gnss[1, t, order].ravel()
+        z = np.append(fixes, edges.T @ vectors if laplacian else vectors)
         if t:
             peer.update(z, R=noise)
         else:
-            begin(peer, z, noise, np.concatenate([z[:3], (z[:3] + ahead).ravel()]))
-        assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-9)
-        assert track.covariance[0, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
+            weight, at = peer.H.T @ np.linalg.inv(noise), np.append(fixes[:3], fixes[:3] + vectors)
+            peer.P = np.linalg.inv(n / 1e6 + weight @ peer.H)
+            peer.x = at + peer.P @ weight @ (z - peer.H @ at)
+        assert track.x[1, t, 0] == pytest.approx(peer.x[:3], abs=1e-9)
+        assert track.covariance[1, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
 
 
 def test_the_angle_is_atan2():
     for turn in np.concatenate([np.linspace(-3.14, 3.14, 301), [0.0, 1e-9, -1e-300, 0.2449, -0.245]]):
         assert angle(3 * math.sin(turn), 3 * math.cos(turn)) == pytest.approx(turn, rel=1e-15, abs=0)
-
-
-def test_the_laplacian_filter_equals_filterpy(formation):
-    """Per axis, over the star of a formation that never changes, from its first estimate on."""
-    recording, known = star_of_four(formation)
-    track = LKFSA(known)(recording, [0])
-    order, laplacian = [0, *recording.links.neighbour[:3]], np.diag([3.0, 1.0, 1.0, 1.0])
-    laplacian[0, 1:] = laplacian[1:, 0] = -1.0
-    seen = recording.relative[1].reshape(40, 3, 3)
-    ahead = to_vector(seen)
-    variance = np.trace(vector_cov(seen, S2.relative_std, S2.min_range), axis1=-2, axis2=-1).mean(axis=1) / 3
-    for c in range(3):
-        peer = KalmanFilter(dim_x=4, dim_z=8, dim_u=4)
-        peer.B, peer.H = 0.1 * np.eye(4), np.vstack([laplacian, np.eye(4)])
-        peer.Q = known.process_std[c] ** 2 * np.eye(4)
-        for t in range(40):
-            noise = np.diag([*(np.diag(laplacian) * variance[t]), *np.full(4, known.gnss_variance[c])])
-            z = np.array([-ahead[t, :, c].sum(), *ahead[t, :, c], *recording.gnss[1, t, order, c]])
-            if t:
-                peer.predict(u=recording.velocity[1, t, order, c])
-                peer.update(z, R=noise)
-            else:
-                begin(peer, z, noise, z[4] + np.array([0.0, *z[1:4]]))
-            assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
-            assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
 
 
 def test_a_range_of_almost_nothing_leaves_covariances_positive():

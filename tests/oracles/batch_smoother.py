@@ -6,7 +6,7 @@ from coopoc.world.links import spherical, to_vector, wrap
 from oracles.messages import slopes
 
 
-def batch_smoother(recording, noise_model, run, x, most=40):  # type: ignore[no-untyped-def]
+def batch_smoother(recording, noise_model, run, x):  # type: ignore[no-untyped-def]
     """Positions (T, N, 3) from a start of that shape, and covariances (T, N, 3, 3), of one run."""
     gnss, velocity, seen = (v[run] for v in (recording.gnss, recording.velocity, recording.usable_relative))
     q, r = (
@@ -20,7 +20,7 @@ def batch_smoother(recording, noise_model, run, x, most=40):  # type: ignore[no-
     index = {key: 3 * k for k, key in enumerate(zip(*np.nonzero(active), strict=True))}
     size, eye = 3 * len(index), np.eye(3)
     x = np.where(active[..., None], x, np.nan)
-    for _ in range(most if noise_model.sensors else 1):
+    for _ in range(40 if noise_model.sensors else 1):
         A, b = np.zeros((size, size)), np.zeros(size)
 
         def add(terms, W, w, A=A, b=b):  # type: ignore[no-untyped-def]

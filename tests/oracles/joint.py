@@ -4,22 +4,26 @@ Predict x_j += moved_j, P += Q. Update in information form with H and R as they 
 Gauss-Newton step of the same cost at the solution of the linear update, with range and angles themselves.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
 from coopoc.kernels.stars.messages import FORGOTTEN
 from coopoc.world.links import spherical, to_vector, wrap
-from oracles.messages import Member, directions, separate, slopes
+from oracles.messages import Member, directions, slopes
 
 
-def follow(stars: list[list[Member]], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats, list[Floats]]:
+def follow(stars: list[list[Member]], updated: Callable[..., Any]) -> tuple[Floats, Floats, list[Floats]]:
     """x (T, 3), covariance (T, 3, 3) and the neighbours (k, 3) at each step."""
     x, p, estimates = np.zeros((0, 3)), np.zeros((0, 0)), []
     for star in stars:
-        x, p = update(*predict(x, p, star), star, noise_model, exact)
+        x, p = updated(*predict(x, p, star), star)
         estimates.append((x, p[:3, :3]))
-    return separate(estimates)
+    xs, covariances = zip(*estimates, strict=True)
+    return np.array([x[0] for x in xs]), np.array(covariances), [x[1:] for x in xs]
 
 
 def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:

@@ -57,10 +57,3 @@ def members(star: StarStep, run: int) -> list[Member]:
         )
         for k, index in enumerate(star.previous)
     ]
-
-
-def separate(estimates: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats, list[Floats]]:
-    """Positions (k, 3) of a star and the covariance of its ego at each step -> the ego's x (T, 3), its covariance, and
-    the neighbours (k, 3) at each step."""
-    xs, covariances = zip(*estimates, strict=True)
-    return np.array([x[0] for x in xs]), np.array(covariances), [x[1:] for x in xs]
