@@ -1,10 +1,12 @@
 """Benchmarks: the gate of benchmarks/run.py on made-up tables, CL-Bench and its cards."""
 
+import ast
 import hashlib
 import json
 import re
 import sys
 from dataclasses import replace
+from pkgutil import resolve_name
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 import run
 from conftest import measured, refused
 from shell import ROOT
+from test_layering import imports
 
 import coopoc as co
 from coopoc.data.log.residuals import TRUE_POSE_STD, together
@@ -38,6 +41,29 @@ def test_the_gate_names_the_row_that_is_slower(ratio):
 def test_a_row_that_was_not_measured_fails_unless_its_benchmark_did_not_run():
     assert run.slower([row("a: ours", 1.0)], BASELINE, ["a", "b"]) == ["b: ours: in the baseline, but not measured"]
     assert run.slower([row("a: ours", 1.0)], BASELINE, ["a"]) == []
+
+
+SCRIPTS = [path for folder in ("benchmarks", "docs", "examples") for path in (ROOT / folder).rglob("*.py")]
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_what_a_script_takes_from_the_package_and_from_others_is_there(path, monkeypatch):
+    """Names that it imports, and attributes of modules: not all scripts run in tests."""
+    monkeypatch.syspath_prepend(path.parent)
+    nodes = [*ast.walk(ast.parse(path.read_text()))]
+    short = {alias.asname: alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    wanted = {name for source, names in imports(path.stem, path) for name in names or {source}}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in short:
+            wanted.add(f"{short[node.value.id]}.{node.attr}")
+    for name in wanted:
+        package = name.split(".")[0]
+        if package == "coopoc" or path.with_name(f"{package}.py").is_file():
+            try:
+                resolve_name(name)
+            except ModuleNotFoundError as error:  # a peer's library may be absent
+                if (error.name or "").startswith("coopoc"):
+                    raise
 
 
 def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows():
