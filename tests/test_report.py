@@ -102,9 +102,11 @@ def test_a_page_on_several_studies_opens_with_what_each_found(made, tmp_path):
     folder = made[0].parents[1] / "small"
     manifest = shutil.copytree(folder, tmp_path / "other") / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"study": "small"', '"study": "other"'))
-    opening = report([manifest.parent, folder], tmp_path / "r.html").read_text().partition("<nav")[0]
-    order = ("What is a neighbour worth", "KF: ", '<figure class="first">', '<a href="#other">Details')
+    opening, _, rest = report([manifest.parent, folder], tmp_path / "r.html").read_text().partition("<nav")
+    order = ("What is a neighbour worth", "KF: ", '<figure id="other-figure-rt_le">', "Figure 1.1.")
     assert sorted(order, key=opening.index) == [*order]
+    assert '<figure id="small-figure-rt_le">' in rest
+    assert order[2] not in rest
 
 
 def test_folders_that_cannot_be_shown_are_named(made, tmp_path):

@@ -1,10 +1,12 @@
 """Figures: the same bytes twice, one look per method, and what is drawn is what was measured."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from numpy.testing import assert_allclose
 from shell import ROOT
 
 from coopoc.plugins import find
+from coopoc.studies import weights
 from coopoc.studies.error_cdf import quantile
 from coopoc.study import figures
 from coopoc.study.results import Results
@@ -224,3 +227,11 @@ def test_no_figure_of_the_gallery_hides_a_line(file):
                     apart = max(gaps, default=np.inf) * 72 / panel.figure.dpi > first.get_linewidth() / 2
                     assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
     assert lines_seen or not find("coopoc.studies", file.stem).figures
+
+
+def test_the_first_finding_of_the_paper_says_what_both_cost(monkeypatch):
+    card = {"history": [{"sent_bytes": 3e6, "received_bytes": 5e6}], "clients": "abcd"}
+    monkeypatch.setattr(weights, "checkpoint", lambda *_: SimpleNamespace(card=card))
+    (reference,) = (file for file in FILES if file.stem == "neighbours")
+    first, *_ = find("coopoc.studies", "neighbours").answers(from_reference(reference))
+    assert re.search(r"10 neighbours give 0\.5\d m for 1,000 B/s of messages, .* m for 2\.0 MB, once", first), first

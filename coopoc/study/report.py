@@ -54,12 +54,11 @@ def report(
             "folders", names or "none", "must be at least one, of different studies", "Give coopoc report FOLDER."
         )
     several = sections if len(sections) > 1 else []
-    opening = [{**s["figures"][0], "section": s["name"]} for s in several if s["figures"]]
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
         answers={s["question"]: s["findings"][0] for s in several if s["findings"]},
-        first=opening[0] if opening else None,
+        first=next((number for number, s in enumerate(several, 1) if s["figures"]), 0),
         sections=sections,
         cards=cards or {},
         environment=environments([section["environment"] for section in sections]),
