@@ -1,6 +1,7 @@
 """The README's table by a simulation that shares no code with the toolkit, on the fleet's arrays alone."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -21,6 +22,21 @@ def published(most: int, method: str, noise_model: str) -> tuple[float, float]:
         if where | wanted == where:
             return number["value"], number["run_std"]
     raise AssertionError((most, method, noise_model))
+
+
+NAMES = {"Kalman filter": "kalman", "FedKalmanNet": "fedkalmannet", "LKF-SA": "lkf-sa", "joint filter": "joint"}
+
+
+def test_the_table_of_the_answer_is_the_committed_one():
+    """Errors by the reference, the robots' by the page on them."""
+    readme, real = ((ROOT / page).read_text() for page in ("README.md", "docs/real.md"))
+    rows = re.findall(r"^\|(\w+): (.+?)\|(\w+)\|(\S+) \[(\S+), (\S+)\]\|(.*)", readme, re.MULTILINE)
+    for kind, name, noise_model, mean, low, high, rest in rows:
+        most = 10 * (kind in ("decide", "both"))
+        assert f"{published(most, NAMES[name], noise_model)[0]:.2f}" == mean
+        assert low < mean < high
+        assert all(f"| {robots} |" in real.replace("*", "") for robots in re.findall(r"[\d.]+ \[.*?\]", rest))
+    assert len(rows) == 5
 
 
 @pytest.mark.parametrize("most", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 4, 10))])
