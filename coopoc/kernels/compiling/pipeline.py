@@ -6,12 +6,22 @@ from numba._dynfunc import make_function
 from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
+from numba.core.typed_passes import NopythonRewrites
+from numba.core.types.functions import BaseFunction
+from numba.core.untyped_passes import InlineClosureLikes
 
 
 class KernelLibrary(JITCodeLibrary):
     """Instructions, optimised when all that they call stands beside them; those of a part wait for a caller."""
 
     is_part: bool
+
+    def finalize(self) -> None:
+        """Link what is called, and what that calls, once into what Python calls, and nothing into a part."""
+        called = self._linking_libraries
+        self._linking_libraries = [] if self.is_part else [*_all_called(called)]
+        super().finalize()
+        self._linking_libraries = called
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -27,11 +37,35 @@ class KernelLibrary(JITCodeLibrary):
         self._finalized = True
 
 
+def _all_called(libraries: Any) -> dict[Any, None]:
+    """Libraries in order, and those that wait in parts among them."""
+    found, left = dict[Any, None](), [*libraries]
+    while left:
+        library = left.pop()
+        if library not in found and getattr(library, "is_part", False):
+            left += library._linking_libraries
+        found[library] = None
+    return found
+
+
 class KernelFlags(Flags):  # numba looks options up for every operation that it types
     """Options that are compared by what was set of them."""
 
     __hash__ = lambda self: hash(tuple(self._values))  # noqa: E731
     __eq__ = lambda self, other: self._values == other._values  # noqa: E731
+
+
+UNUSED = InlineClosureLikes, NopythonRewrites
+"""Passes for what no kernel has: closures, comprehensions and sums of whole arrays."""
+RESOLVE, KNOWN = BaseFunction.get_call_type, dict[Any, Any]()
+
+
+def _known_call(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """The signature of a function of numba's own: it would try every implementation at each call."""
+    key = self, args, *kws.items()
+    if key not in KNOWN:
+        KNOWN[key] = RESOLVE(self, context, args, kws)
+    return KNOWN[key]
 
 
 class Kernel(CompilerBase):
@@ -44,11 +78,19 @@ class Kernel(CompilerBase):
         library: Any = KernelLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
         self.state.library, library.is_part = library, self.is_part
         library.enable_object_caching()
-        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        manager.passes = [each for each in manager.passes if each[0] not in UNUSED]
+        manager.finalize()
+        return [manager]
 
     def _compile_core(self) -> Any:
         self.state.flags, self.state.flags.no_compile = KernelFlags(self.state.flags), self.is_part  # type: ignore[no-untyped-call]
-        made = super()._compile_core()  # type: ignore[no-untyped-call]
+        resolve = BaseFunction.get_call_type
+        BaseFunction.get_call_type = _known_call
+        try:
+            made = super()._compile_core()  # type: ignore[no-untyped-call]
+        finally:
+            BaseFunction.get_call_type = resolve
         if self.is_part:
             desc, libraries = made.fndesc, (made.library,)
             key = make_function(desc.lookup_module(), desc.qualname, "", 0, made.environment, libraries)
