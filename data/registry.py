@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from coopoc import Fleet, InputError
+from coopoc.arrays import instance
 from coopoc.errors import suggestion, unknown
 from coopoc.plugins import find, in_file, names
 from coopoc.world.storage import read_recording
@@ -62,12 +63,7 @@ def bundled(name: str) -> Fleet:
     return replace(read_table(FLEETS / f"{name}.parquet"), source=source, licence=made["map_licence"])
 
 
-DATASETS = {
-    "town04": partial(bundled, "town04"),
-    "town10": partial(bundled, "town10"),
-    "town10-clients": partial(bundled, "town10-clients"),
-    "town10-validation": partial(bundled, "town10-validation"),
-}
+DATASETS = {name: partial(bundled, name) for name in ("town04", "town10", "town10-clients", "town10-validation")}
 """Bundled fleets; the names are written out so that a list of them imports nothing."""
 
 
@@ -129,8 +125,10 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
         if options:
             raise InputError("options", sorted(options), f"{name} is bundled and takes none", "Leave them out.")
-        made: Fleet = parted(_made(find("coopoc.datasets", name), name), **part)
-        return made
+        registered = find("coopoc.datasets", name)
+        made = registered if isinstance(registered, Fleet) else registered()
+        whole: Fleet = parted(instance(f"what data {name!r} gives", made, Fleet, "Return coopoc.Fleet(...)."), **part)
+        return whole
     there(name)
     path = Path(name)
     chosen = chosen or detect(path, options.get("columns"))
@@ -249,11 +247,3 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
         if str(each).encode(errors="replace").decode() != str(each):
             raise InputError("data", ascii(str(each)), "must have a name in UTF-8", "Rename it.")
     return read(path, **options)
-
-
-def _made(registered: Any, name: str) -> Fleet:
-    """A registered Fleet, or the one that a registered function returns."""
-    fleet = registered if isinstance(registered, Fleet) else registered()
-    if not isinstance(fleet, Fleet):
-        raise InputError("data", repr(name), f"gives a {type(fleet).__name__}, no Fleet", "Return coopoc.Fleet(...).")
-    return fleet

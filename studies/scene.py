@@ -109,7 +109,7 @@ def _there(data: str) -> Bools:
     if log is None:
         return fleet(data).present
     velocity, started = log.recording.velocity[0], np.isfinite(log.recording.gnss[0, :, :, 0])
-    there: Bools = np.isfinite(velocity[..., 0]) & np.maximum.accumulate(started, axis=0)
+    there: Bools = log.recording.present & np.maximum.accumulate(started, axis=0)
     standing = (np.nan_to_num(velocity) == 0).all(axis=(0, 2))
     if not standing.all():
         there &= ~standing  # a road-side unit knows where it is

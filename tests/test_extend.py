@@ -109,7 +109,7 @@ def test_a_backend_is_checked_as_all_are(folder, monkeypatch):
     assert early.status is not Status.SOLVED  # it may claim what it likes
     with refused(r"rounds = 3: is no option of least-squares"):
         solve(problem, "least_squares.py:BACKEND", rounds=3)
-    with refused(r"is a function, no Backend"):
+    with refused(r"must be a Backend"):
         solve(problem, "least_squares.py:solver")
 
 
@@ -164,7 +164,7 @@ def test_a_channel_and_a_metric_keep_their_promise(tmp_path, crossing):
         "def none(k):\n    return k\ndef flat(track, fleet):\n    return track.x[0, 0, 0]\n"
     )
     track = GNSS()(observe(crossing, Sensors()))
-    with refused("returned int, no V2X"):
+    with refused("must be a V2X"):
         channel(f"{tmp_path}/own.py:none")
     with refused(r"must have shape \(R, E\) = \(1, 1\)"):
         measure(f"{tmp_path}/own.py:flat", track, crossing)
@@ -240,7 +240,7 @@ def test_what_is_not_there_is_named(tmp_path):
     for name, message in (("Mute", "must have a name"), ("half", "cannot be called")):
         with refused(message):
             own(f"{tmp_path}/own.py:{name}")
-    with refused(r"is a int, no Study"):
+    with refused(r"ALPHA' = 1: must be a Study"):
         run_study(f"{tmp_path}/own.py:ALPHA")
     with pytest.raises(TypeError):
         load_fleet(f"{tmp_path}/own.py:ALPHA")

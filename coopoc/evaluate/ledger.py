@@ -134,7 +134,7 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     for k, on_air in enumerate((track.sent_bytes, track.received_bytes)):
         payload = on_air * (message.size() / size if size else 1.0)
         if message.per_neighbour:
-            payload = on_air - overhead * np.isfinite(recording.velocity[0, :, track.egos, 0]).sum(axis=1)
+            payload = on_air - overhead * recording.present[:, track.egos].sum(axis=0)
         moved[k] = payload, on_air
     steps = np.full(vehicles, len(track.t)) if track.absent is None else (~track.absent).sum(axis=0)
     return Ledger(tuple(recording.ids[ego] for ego in track.egos), steps * recording.dt, *moved)

@@ -7,8 +7,7 @@ import numpy as np
 
 from ..arrays import AnyArray
 from ..errors import InputError, shown
-from ..methods.gaps import follow, needs_fix
-from ..methods.track import Method, Track, far_off
+from ..methods.track import Method, Track, far_off, follow, needs_fix
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles
 from .ledger import Kind, Way, of_track
@@ -64,7 +63,7 @@ def scored(
     (3, 1)
     """
     seconds, parts, squares = 0.0, [], []
-    there = np.isfinite(recording.velocity[0][:, [recording.ids.index(ego) for ego in egos], 0])
+    there = recording.present[:, [recording.ids.index(ego) for ego in egos]]
     has_truth = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
     for part in slabs(recording, len(egos)):
         track = follow(method, part, egos)

@@ -7,7 +7,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
-from ..arrays import TINY, Floats, number
+from ..arrays import TINY, Floats, instance, number
 from ..errors import InputError, MissingLibraryError, dependencies, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
@@ -142,8 +142,4 @@ def require_backend(backend: str | Backend) -> Backend:
 @lru_cache(maxsize=64)
 def _registered(name: str) -> Backend:
     """The backend of a name; kept, since reading the entry points takes longer than a small solve."""
-    backend = find("coopoc.backends", name)
-    if not isinstance(backend, Backend):
-        hint = "Give coopoc.Backend(name, solver)."
-        raise InputError("backend", repr(name), f"is a {type(backend).__name__}, no Backend", hint)
-    return backend
+    return instance(f"backend {name!r}", find("coopoc.backends", name), Backend, "Give coopoc.Backend(name, solver).")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import listed, named
+from ..arrays import instance, listed, named
 from ..errors import InputError, unknown
 from ..paths import file_name
 from ..plugins import file_digest, find, from_file, in_file
@@ -166,10 +166,8 @@ def find_study(name: str) -> Study:
     if not in_file(name):
         installed: Study = find("coopoc.studies", name)
         return installed
-    study = from_file(name, "study")
-    if not isinstance(study, Study):
-        hint = "Give STUDY = coopoc.Study(...) in the file."
-        raise InputError("study", repr(name), f"is a {type(study).__name__}, no Study", hint)
+    hint = "Give STUDY = coopoc.Study(...) in the file."
+    study = instance(f"study {name!r}", from_file(name, "study"), Study, hint)
     path, _, attribute = name.rpartition(":")
     code, own = code_of(study.cell), study.key
 
@@ -207,10 +205,16 @@ def _named(study: Study, params: Mapping[str, Scalar], code: Callable[[], str]) 
         if not isinstance(value, Scalar):
             raise InputError(name, repr(value), "must be a number, a word, a bool or None", "Pass a name instead.")
     values = {**study.settings, **params}
-    content = {"study": study.name, "given": values, "axes": sorted(params), "key": study.key(values)}
-    content["code"] = code()
-    content["files"] = {name: file_digest(v, name) for name, v in values.items() if isinstance(v, str) and in_file(v)}
-    return Cell(params, values, digest({**content, "coopoc": metadata.version("coopoc")}))
+    content = {
+        "study": study.name,
+        "given": values,
+        "axes": sorted(params),
+        "key": study.key(values),
+        "code": code(),
+        "files": {name: file_digest(v, name) for name, v in values.items() if isinstance(v, str) and in_file(v)},
+        "coopoc": metadata.version("coopoc"),
+    }
+    return Cell(params, values, digest(content))
 
 
 def points(study: Study) -> list[Mapping[str, Scalar]]:

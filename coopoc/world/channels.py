@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from ..arrays import Bools, Floats
-from ..errors import InputError
+from ..arrays import Bools, Floats, instance
 from ..plugins import called
 from .v2x import V2X
 
@@ -53,7 +52,4 @@ def channel(name: str, max_neighbours: int = 6) -> V2X:
     10.0
     """
     hint = "Give a function of the number of neighbours that returns V2X(max_neighbours, ...)."
-    result = called("coopoc.channels", name, hint, max_neighbours)
-    if not isinstance(result, V2X):
-        raise InputError("channel", name, f"returned {type(result).__name__}, no V2X", hint)
-    return result
+    return instance(f"what channel {name!r} returns", called("coopoc.channels", name, hint, max_neighbours), V2X, hint)

@@ -82,18 +82,12 @@ def _newest(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Int
     newest, fresh = np.empty(arrival.shape, dtype=np.int64), np.empty(arrival.shape, dtype=bool)
     for one in np.unique(neighbour):
         pair = np.flatnonzero(neighbour == one)
-        held = _newest_of_pair(arrival[:, pair], sent[pair], steps)[:, sent[pair]]
-        newest[:, pair] = held
+        run, k = np.nonzero(arrival[:, pair] >= 0)
+        held = np.full((len(arrival), steps), -1, dtype=np.int64)
+        np.maximum.at(held, (run, arrival[run, pair[k]]), sent[pair[k]])
+        newest[:, pair] = held = np.maximum.accumulate(held, axis=1)[:, sent[pair]]
         fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0
     return newest, fresh
-
-
-def _newest_of_pair(arrival: Ints, sent: Ints, steps: int) -> Ints:
-    """(R, T) newest sending step among the messages of one pair that have arrived by each step."""
-    held = np.full((len(arrival), steps), -1, dtype=np.int64)
-    run, k = np.nonzero(arrival >= 0)
-    np.maximum.at(held, (run, arrival[run, k]), sent[k])
-    return np.maximum.accumulate(held, axis=1)
 
 
 def within_cap(arrival: Ints, size: int, start: Ints, sender: Ints, recording: Recording) -> Ints:

@@ -1,7 +1,7 @@
 """Recording: all that vehicles may see of a drive, in R noise realisations. It holds no truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -119,8 +119,8 @@ class Recording:
     notes: tuple[str, ...] = ()
     body: Body | None = None
     landmarks: tuple[int, ...] = ()
-    fix_factor: Floats = field(default_factory=lambda: np.empty(0))
-    motion_variance: Floats = field(default_factory=lambda: np.empty(0))
+    fix_factor: Floats = ()  # type: ignore[assignment]
+    motion_variance: Floats = ()  # type: ignore[assignment]
 
     __reduce__ = remade
 
@@ -173,6 +173,11 @@ class Recording:
         """(T, N, 1) m^2 a step, of `motion_variance`, or zeros."""
         more = self.dt * self.motion_variance if self.motion_variance.size else 0.0
         return np.broadcast_to(more, self.gnss.shape[1:3])[..., None]
+
+    @property
+    def present(self) -> Bools:
+        """(T, N) whether a member is there."""
+        return np.isfinite(self.velocity[0, ..., 0])
 
     @property
     def vehicles(self) -> list[int]:
@@ -254,8 +259,8 @@ class Recording:
         """
         (col,) = columns("vehicle", [vehicle], self.ids)
         least, every = number("shortest", shortest, kind=int), not instance("fixed", fixed, bool)
-        there = np.isfinite(self.velocity[0, :, col, 0])
         has_fix = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | every
+        there = self.present[:, col]
         firsts = [(a + int(np.argmax(has_fix[a:b])), b) for a, b in stretches(there) if has_fix[a:b].any()]
         return tuple((a, b) for a, b in firsts if b - a >= least)
 

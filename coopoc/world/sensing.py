@@ -78,14 +78,14 @@ def observe(
     gnss = _gnss(fleet, sensors, runs, seed, remove_outliers)
     gnss[:, :, standing] = fleet.position[:, standing]
     relative = _relative_measurements(fleet, links, sensors, v2x, runs, seed, remove_outliers)
-    body = None
+    body, moved = None, fleet.velocity
     if frame == "world":
-        velocity = _velocity(fleet, sensors, runs, seed, remove_outliers)
+        velocity = _noisy(fleet, "velocity", runs, seed, moved, sensors.velocity_std(moved))
     else:
-        velocity, body = body_measurements(fleet, sensors, runs, seed)
-        if sensors.outliers:
-            wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, remove_outliers)
+        (velocity, body), (moved, _) = body_measurements(fleet, sensors, runs, seed), body_motion(fleet)
         relative = in_body(relative, fleet, links, _own_errors(fleet, links, sensors, runs, seed, *HEADING))
+    if sensors.outliers:
+        wrong_odometry(velocity, moved, fleet, sensors.outliers, seed, remove_outliers)
     for array in (gnss, velocity, relative):
         array.flags.writeable = False  # so that the Recording need not copy them
     wrong = sensors.outliers.notes if sensors.outliers else ()
@@ -197,13 +197,6 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, remove_outliers:
     if sensors.outliers:
         wrong_fixes(fixes, fleet, sensors.outliers, seed, remove_outliers)
     return fixes
-
-
-def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, remove_outliers: bool) -> Floats:
-    velocity = _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
-    if sensors.outliers:
-        wrong_odometry(velocity, fleet.velocity, fleet, sensors.outliers, seed, remove_outliers)
-    return velocity
 
 
 def _pairs(ids: Sequence[str], links: Links) -> Pairs:
