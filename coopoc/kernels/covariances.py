@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from ..arrays import Floats, Ints
-from .compiling.compile import compiled, part
+from .compiling.compile import compiled
 from .compiling.small import subtract
 from .gate import FIX_GATE, HARD_REJECT_FACTOR
 from .geometry import direction, five, residuals, with_std
@@ -38,12 +38,6 @@ def unsound(cov: Floats) -> int:
         if not (sound and skew <= (MAX_CORRELATION2 - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
             count += 1
     return count
-
-
-@part
-def less(a: Floats, b: Floats) -> tuple[float, float, float]:
-    """a - b, three numbers."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @compiled
@@ -145,7 +139,7 @@ def mark_neighbours(
                 own += (cov[run, t, c, c] + fix[t, j, 1, c]) / 3.0
             if t < counts[j, 0] or math.isnan(gap[0]):
                 continue
-            polar = direction(gap[0], gap[1], gap[2])
+            polar = direction(vector_at(gap, 0))
             measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)
             far, reach = residuals(measured, polar), polar[0] * polar[3]
             q = far[0] ** 2 / (measured[5] ** 2 + own) + (far[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)

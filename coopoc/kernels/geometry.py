@@ -75,8 +75,9 @@ def vector(polar: Numbers) -> Numbers:
 
 
 @inner
-def direction(x: float, y: float, z: float) -> Five:
+def direction(gap: Numbers) -> Five:
     """Polar form of a vector: length, sine and cosine of azimuth and of inclination, 0 and 1 along z."""
+    x, y, z = gap
     flat2 = plus(x * x, y, y)
     flat, d = math.sqrt(flat2), math.sqrt(plus(flat2, z, z))
     o, over, over_d = 0.0 * d, 1.0 / flat, 1.0 / d
@@ -162,7 +163,7 @@ def metres(polar: Numbers, std: Numbers | Floats, least: float) -> Numbers:
 def converted(gap: Numbers, measured: Numbers, unit: bool, least: float) -> tuple[Numbers, Numbers]:
     """C^-1 and C^-1 (measured vector - gap), weighted by the geometry of the vector `gap`, or by 1 m along each axis if
     `unit`; components that are missing are those of `gap`."""
-    polar = direction(gap[0], gap[1], gap[2])
+    polar = direction(gap)
     a, b, c = measured[5:] if unit else metres(polar, measured[5:], least)
     weight = spread(polar, 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c))
     return weight, apply(weight, subtract(vector(completed(measured, polar)), gap))
@@ -182,7 +183,7 @@ def residuals(measured: Numbers, polar: Numbers) -> tuple[float, float, float]:
 def exact(gap: Numbers, measured: Numbers, least: float) -> tuple[Numbers, Numbers]:
     """J^T J and J^T r of the whitened range, azimuth and inclination at the vector `gap`; an angle weighs no more than
     at `least` m."""
-    polar = direction(gap[0], gap[1], gap[2])
+    polar = direction(gap)
     longer, turned, raised = residuals(measured, polar)
     d, reach = polar[0], max(polar[0], least)
     a, b, c = 1.0 / measured[5], 1.0 / measured[6], 1.0 / measured[7]

@@ -177,18 +177,10 @@ def update_jointly(
             poses.x[:], poses.cov[:], poses.totals[COST] = poses.prior_x, poses.prior_cov, cost
         for k in range(begin, end):
             ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
-            bits = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])
+            landmark, relative, bits = measured.landmark[k], measured.relative[run, k], left_out[k - begin]
+            bits = update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, bits)
             left_out[k - begin] = bits
         apply_pending_rows(poses)
-
-
-@part
-def add_relative(
-    measured: PoseMeasurements, noise: PoseNoise, poses: Poses, ends: tuple[int, int], run: int, k: int, left_out: int
-) -> int:
-    """Relative measurement k of members at `ends`."""
-    landmark, relative = measured.landmark[k], measured.relative[run, k]
-    return update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, left_out)
 
 
 @part
@@ -228,7 +220,8 @@ def fuse_pair(
             set_member(pair, d, poses, other, d, max(1.0 - weight, 1e-9) if tries > 0 else 1.0)
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
-        add_relative(measured, noise, pair, ends, run, k, ZERO)
+        landmark, relative = measured.landmark[k], measured.relative[run, k]
+        update_relative(pair, ends, landmark, relative, noise.relative, noise.gate, noise.longer, ZERO)
         apply_pending_rows(pair)
         total = 0.0
         for i in range(d):

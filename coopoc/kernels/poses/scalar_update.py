@@ -251,7 +251,7 @@ def update_relative(
     """
     (k, o), linear = ends, poses.linear
     position = landmark if o < 0 else linear[o : o + 3]
-    polar = direction(position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2])
+    polar = direction((position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2]))
     curved = curvature(poses.prior_cov, ends, polar)
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):

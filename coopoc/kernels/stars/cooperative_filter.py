@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import apply, inner_product, negate, store, subtract
+from ..compiling.small import apply, inner_product, load, negate, store, subtract
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
@@ -29,6 +29,7 @@ from .cooperative_state import (
     DT,
     ESTABLISHED,
     EXTRA_VARIANCE,
+    FIVE,
     FIX,
     FIX_VARIANCE,
     FIXES,
@@ -514,7 +515,7 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     if not measured_whole(rows, row) and f.member[k, EXTRA_VARIANCE] > 0.0:
         return False
     x, y, z = subtract(vector_at(f.member[k], AT // 3), vector_at(f.member[0], AT // 3))
-    d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
+    d, sa, ca, si, ci = load(rows[row], 0, FIVE)
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
     reach = max(far, model.min_range)
     flat = max(ground / far, 1e-3) * reach

@@ -181,9 +181,9 @@ def stand(f: Filter, rows: Floats, k: int) -> None:
     """Move a member of whose position nothing is known to where the ego measures it, or, where a component is missing,
     somewhere near: its measurement is linear there."""
     g, row, first = f.g, f.who[k, INPUT], 3 * f.g.block[k, PLACE]
-    near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
+    near, whole, gap = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row), measured_vector(rows, row)
     for c in range(3):
-        g.x[first + c] = g.x[c] + (measured_vector(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
+        g.x[first + c] = g.x[c] + (gap[c] if whole else near * (1.0 if c < 2 else 0.1))
 
 
 @part

@@ -125,7 +125,7 @@ it was there, s, which is when it sent its newest message; the step at which it 
 that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its fixes; and, out, the squared
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
-NO_VOTES = (0.0,) * 9
+FIVE, NO_VOTES = (0.0,) * 5, (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, BARE, LEFT = 20, 26, 32, 38, 51, 54, 63, 66
 AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, EGO = 73, 74, 75, 76, 84, 93, 94, 97
@@ -398,19 +398,19 @@ def position(own: Floats, rows: Floats, i: int, c: int) -> tuple[float, float]:
 @part
 def seen_from(rows: Floats, row: int, c: int) -> float:
     """Component c m of where the ego is by a neighbour's message; NaN if that has no position."""
-    position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - measured_vector(rows, row, c)
+    position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - measured_vector(rows, row)[c]
     return position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan
 
 
 @part
-def measured_vector(rows: Floats, row: int, c: int) -> float:
-    """Component c of the measured vector to a neighbour, m."""
-    d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
+def measured_vector(rows: Floats, row: int) -> Vector:
+    """The measured vector to a neighbour, m."""
+    d, sa, ca, si, ci = load(rows[row], 0, FIVE)
+    return d * si * ca, d * si * sa, d * ci
 
 
 @inside
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
-    angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)
-    return bool(rows[row, 0] >= 0.0 and angles)
+    d, sa, ca, si, ci = load(rows[row], 0, FIVE)
+    return bool(d >= 0.0 and (sa != 0.0 or ca != 0.0) and (si != 0.0 or ci != 0.0))

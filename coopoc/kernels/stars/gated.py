@@ -32,13 +32,13 @@ from ..gate import (
 from ..geometry import Numbers, axes, direction, incomplete, residuals, vector, whole
 from .messages import (
     BLOCK,
-    RELATIVE,
     ROW,
     VARIANCE,
     Star,
     moved_of,
     position_of,
     process_of,
+    relative_of,
     variance_of,
     vector_at,
 )
@@ -114,7 +114,7 @@ def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
     own = add(variance, variance_of(star, 0))
     noise = add(own, (o + 1.0, o + 1.0, o + 1.0))
     for k in range(1, n):
-        polar = load(star.relative, k, RELATIVE)
+        polar = relative_of(star, k)
         gap, sent = subtract(position_of(star, k), add(at, vector(polar))), variance_of(star, k)
         q = distance(gap, add_diagonal(zeros(o, BLOCK), add(noise, sent)))
         agree = agree + choose(o + FIX_GATE - q, choose(o + NO_FIX_M2 - sent[0], whole(polar), o), o)
@@ -167,7 +167,7 @@ def gate_star(star: Star, gates: Gates, state: Floats, placed: Floats, least: fl
     o, hits = 0.0 * ego[12], ego[12]
     total = own = gate_position(star, 0, origin, ego[:9], hits)
     for k in range(1, n):
-        at, polar, memory = vector_at(state, k), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
+        at, polar, memory = vector_at(state, k), relative_of(star, k), load(gates.state, k, STATE)
         std = polar[5:]
         if incomplete(polar):
             far = o + math.inf
@@ -219,7 +219,7 @@ def gate_components(
     Returns:
         Covariance, move m, factors of the standard deviations, and hits.
     """
-    polar = direction(gap[0], gap[1], gap[2])
+    polar = direction(gap)
     ray, side, up = axes(polar)
     longer, turned, raised = residuals(measured, polar)
     reach = max(polar[0], least)

@@ -23,7 +23,6 @@ from ..compiling.small import (
     less_applied,
     less_transposed_applied,
     less_transposed_product,
-    load,
     minus_apply,
     minus_product,
     mirrored,
@@ -44,7 +43,6 @@ from .messages import (
     BLOCK,
     NEW,
     NONE,
-    RELATIVE,
     Assumptions,
     Estimates,
     Measurements,
@@ -57,6 +55,7 @@ from .messages import (
     new_estimates,
     position_of,
     process_information,
+    relative_of,
     star_within,
     vector_at,
 )
@@ -200,7 +199,7 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
 @inside
 def first_place(star: Star, k: int, ego: Numbers) -> Lanes:
     """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
-    polar = load(star.relative, k, RELATIVE)
+    polar = relative_of(star, k)
     measured: Numbers = add(ego, vector(polar))
     if not incomplete(polar):
         return measured
@@ -352,7 +351,7 @@ def step(
     place_on_broadcast(star, joint, n)
     if robust:
         for k in range(1, n):
-            store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
+            store(joint.move, k, (placed(joint, k, relative_of(star, k)),))
         gate_star(star, gates, joint.state, joint.move, model.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
@@ -408,7 +407,7 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
             for i in range(n):
                 store(eta, i, vector_at(joint.eta, i))
         for k in range(1, n):
-            polar = load(star.relative, k, RELATIVE)
+            polar = relative_of(star, k)
             gap = subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
             ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
             if stage == 1:

@@ -1,7 +1,7 @@
 """The Laplacian Kalman filter (LKF-SA) of an ego's star, in the blocks of the joint filter."""
 
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
+from ..compiling.small import add, add_diagonal, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
 from ..geometry import Numbers, metres, vector, whole
 from .joint_filter import (
@@ -19,7 +19,6 @@ from .joint_filter import (
 from .messages import (
     BLOCK,
     NONE,
-    RELATIVE,
     Assumptions,
     Estimates,
     Measurements,
@@ -28,6 +27,7 @@ from .messages import (
     clear,
     gather,
     new_estimates,
+    relative_of,
     star_within,
     vector_at,
 )
@@ -58,7 +58,7 @@ def step(star: Star, joint: Joint, model: Assumptions, n: int, old: int) -> None
     predict_state(star, joint, n, old)
     for k in range(1, n):
         if star.previous[k] < 0:
-            measured = vector(load(star.relative, k, RELATIVE))
+            measured = vector(relative_of(star, k))
             store(joint.state, k, add(vector_at(joint.state, 0), measured))
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
     rearrange(star, joint, n, old, (flat, flat, flat))
@@ -79,7 +79,7 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
         edge, gap = edge_to(star, joint, k)
         count, gaps = count + edge, add(gaps, gap)
         if len(std):
-            a, b, c = metres(load(star.relative, k, RELATIVE), std, model.min_range)
+            a, b, c = metres(relative_of(star, k), std, model.min_range)
             total = total + edge * (a * a + b * b + c * c)
     outer = central = o + 1.0
     if len(std):
@@ -102,7 +102,7 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
 @inside
 def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
-    polar = load(star.relative, k, RELATIVE)
+    polar = relative_of(star, k)
     edge = whole(polar)
     gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
     return edge, scale(gap, edge)

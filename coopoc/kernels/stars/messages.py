@@ -12,7 +12,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, choose_each, scale, store
+from ..compiling.small import add, choose_each, load, scale, store
 from ..compiling.vectors import LANES, Lanes, choose, take, unrolled
 from ..geometry import Numbers, with_std
 
@@ -147,6 +147,12 @@ def position_of(star: Star, k: int) -> Lanes:
 def variance_of(star: Star, k: int) -> Lanes:
     """Its variance m^2."""
     return vector_at(star.motion, 4 * k + VARIANCE)
+
+
+@inside
+def relative_of(star: Star, k: int) -> Lanes:
+    """What is measured of member k, the eight numbers of `Star.relative`."""
+    return load(star.relative, k, RELATIVE)
 
 
 @inside

@@ -24,7 +24,6 @@ from ..compiling.small import (
     from_upper,
     inner_product,
     inverse,
-    load,
     minus_product,
     negate,
     scale,
@@ -44,7 +43,6 @@ from .messages import (
     NEW,
     NONE,
     NOWHERE,
-    RELATIVE,
     Assumptions,
     Estimates,
     Measurements,
@@ -56,6 +54,7 @@ from .messages import (
     new_estimates,
     position_of,
     process_of,
+    relative_of,
     star_within,
     variance_of,
     vector_at,
@@ -191,13 +190,8 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
     one, nowhere = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0)), (o + math.nan, o + math.nan, o + math.nan)
     for k in range(1, n):
         gap = subtract(position_of(star, k), x)
-        relative, variance = load(star.relative, k, RELATIVE), variance_of(star, k)
-        polar, noise, theirs, f = (
-            direction(gap[0], gap[1], gap[2]),
-            one,
-            add_diagonal(zeros(o, BLOCK), variance),
-            o + 1.0,
-        )
+        relative, variance = relative_of(star, k), variance_of(star, k)
+        polar, noise, theirs, f = direction(gap), one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
         if fusion.robust:
             ahead = add(own_cov(fusion), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
