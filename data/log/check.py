@@ -1,6 +1,6 @@
 """Innovation and residual statistics of a log (`residuals`), and sentences on what is implausible."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -189,7 +189,7 @@ def _axes(c: Check, column: int) -> str:
     rec = c.world
     moved, driven, *_ = moves(c, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
-    u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
+    u = rec.velocity[0, rec.present[:, column], column, :2]
     height = pd.Series(rec.gnss[0, :, column, 2]).dropna()
     climbed = pd.Series(rec.velocity[0, :, column, 2] * rec.dt).cumsum()[height.index]
     if height.corr(climbed, min_periods=LEAST_COUNT + 1) < -0.9 and np.ptp(climbed) > 4 * rec.sensors.fix_std[2]:
@@ -214,9 +214,9 @@ def _axes(c: Check, column: int) -> str:
     return ""
 
 
-def _of_rows(c: Check) -> list[str]:
+def _of_rows(c: Check) -> Iterator[str]:
     """Measurements and columns that were left out."""
-    summary, sentences = c.log.summary, []
+    summary = c.log.summary
     left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith(EXPECTED)}
     used = [number for why, number in left.items() if any(word in why for word in USED_COUNTS)]
     share = max(
@@ -227,13 +227,14 @@ def _of_rows(c: Check) -> list[str]:
         why = HOLDS if held else max(left, key=lambda reason: left[reason])
         hint = next((hint for begin, hint in ADVICE.items() if why.startswith(begin)), "")
         first = summary.refused[why][1]
-        sentences.append(
+        yield (
             f"{share:.0%} of what was logged is not used, first of all {left[why]} {why}"
             + f" (first: {first})" * bool(first)
             + f". {hint}".rstrip(" ")
         )
-    sentences += [f"{sentence}." for sentence in summary.sentences if sentence.startswith(FAULTS)]
-    return [*sentences, *filter(None, [summary.unread])]
+    yield from (f"{sentence}." for sentence in summary.sentences if sentence.startswith(FAULTS))
+    if summary.unread:
+        yield summary.unread
 
 
 def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
@@ -377,11 +378,11 @@ def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
     return f": its clock differs, which {mends} mends, or velocities are means of the interval before their stamps."
 
 
-def _of_fixes(c: Check) -> list[str]:
+def _of_fixes(c: Check) -> Iterator[str]:
     """A sentence where the fixes of a vehicle are those of an antenna elsewhere, lie behind its truth along its way, by
     the same time at any speed, or beside it by more than their noise explains, as where the truth has another
     origin."""
-    rec, truth, sentences = c.world, c.log.truth, []
+    rec, truth = c.world, c.log.truth
     what = "odometry" if truth is None else "truth"
     off, made, then = causes(c)
     usual = c.fix_noise
@@ -396,7 +397,7 @@ def _of_fixes(c: Check) -> list[str]:
             sure = np.abs(factor) > OFFSET_ERRORS * std
             arm = (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM
             if arm:
-                sentences.append(
+                yield (
                     f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
                     f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {what}: "
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
@@ -405,7 +406,7 @@ def _of_fixes(c: Check) -> list[str]:
         wrong = _beyond(row, "nis", OUTLYING) or row.get("per_std", 0.0) > OUTLYING
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             way = "behind" if lag > 0 else "ahead of"
-            sentences.append(
+            yield (
                 f"{name}: its fixes are {abs(lag):.0f} s {way} the {what}, which "
                 f"they else follow: clocks differ, as by leap seconds (clock={name}:{lag:.0f} where all its stamps "
                 "are so), or files of two drives."
@@ -417,7 +418,7 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         if sure[2] and abs(lag := factor[2]) >= LEAST_LAG:
             way = "ahead of" if lag > 0 else "behind"
-            sentences.append(
+            yield (
                 f"{name}: its fixes are {abs(lag):.2f} s {way} the truth along its way: clocks differ, or fixes carry "
                 "the time at which they arrived; at one speed an antenna ahead looks alike."
             )
@@ -428,7 +429,7 @@ def _of_fixes(c: Check) -> list[str]:
             continue
         east, north, up = (median(axis) for axis in every[both].T)
         if np.ptp(rec.gnss[0, both, column, 2]) and abs(up[0]) > max(OFFSET_ERRORS * up[1], rec.sensors.fix_std[2] / 2):
-            sentences.append(
+            yield (
                 f"{name}: fixes lie {up[0]:.3g} m above the truth in the median. Is one of the two above the "
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
@@ -438,41 +439,39 @@ def _of_fixes(c: Check) -> list[str]:
             like = [one for one, far in zip(rec.ids, pd.DataFrame(theirs[both]).median(), strict=True) if far < usual]
             hint = "Has it another frame? Fixes in degrees are local at the first: give origin= of the truth, or it in "
             hint = f"They follow the truth of {like[0]}: are names exchanged?" if like else f"{hint}degrees."
-            sentences.append(
+            yield (
                 f"{name}: fixes lie {east[0]:.3g} m east and {north[0]:.3g} m north of the truth in the median. {hint}"
             )
-    return sentences
 
 
-def _unseen(c: Check) -> list[str]:
+def _unseen(c: Check) -> Iterator[str]:
     """What the check could not see, and of whom."""
-    sentences, every = [], [row["vehicle"] for row in c.vehicles]
+    every = [row["vehicle"] for row in c.vehicles]
     if c.log.truth is None:
-        sentences.append("errors that all sensors share, and a clock that is wrong for all alike: there is no truth")
+        yield "errors that all sensors share, and a clock that is wrong for all alike: there is no truth"
     if not every:
-        sentences.append("errors of fixes, none of which changes while nothing moves")
+        yield "errors of fixes, none of which changes while nothing moves"
     turns = ("turned", LEAST_TURN, "rad, of the direction of the odometry")
     if c.log.recording.body is not None:
         turns = ("yaw_rate_bias", LEAST_DRIFT, "rad/s, of the yaw rates")
     for name, least, what in (("speed_excess", LEAST_SCALE, "as a share, of the speeds"), turns):
         errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", np.inf) for row in c.vehicles}
         if blind := _below(errors, 2 * least):
-            sentences.append(f"errors, {what} of {blind}")
+            yield f"errors, {what} of {blind}"
         for row in c.vehicles:
             value, error = row.get(name, 0.0), row.get(f"{name}_error", np.inf)
             if max(least, PERHAPS * error) < abs(value) <= SURE_ERRORS * error:
-                sentences.append(
+                yield (
                     f"whether an error of {value:.2g} +- {error:.2g} ({what} of {row['vehicle']}) is more than chance"
                 )
     late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
     if blind := _below(
         {who: SURE_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
     ):
-        sentences.append(f"errors, s, of the clocks of {blind}")
+        yield f"errors, s, of the clocks of {blind}"
     fixes = np.isfinite(c.fix[..., 0]).sum(axis=0)
     if few := [who for who in every if fixes[c.world.ids.index(who)] < LEAST_COUNT]:
-        sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
-    return sentences
+        yield f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes"
 
 
 def _below(errors: Mapping[str, float], enough: float) -> str:
@@ -481,7 +480,7 @@ def _below(errors: Mapping[str, float], enough: float) -> str:
     return ", ".join(f"{name} (below {error:.2g})" if np.isfinite(error) else name for name, error in blind.items())
 
 
-CHECKS: tuple[Callable[[Check], list[str]], ...] = (
+CHECKS: tuple[Callable[[Check], Iterable[str]], ...] = (
     _of_rows,
     _of_clocks,
     of_ranges,

@@ -204,10 +204,9 @@ def odometry(c: Check, column: int) -> Estimate:
     velocity = rec.velocity[0, :, column, :2]
     noise = np.nan_to_num(rec.sensors.velocity_std(velocity, rec.sensors.velocity_floor))
     if truth is None and body is not None:
-        value, error = c.lasting[:, column]
-        attenuation = np.square(noise).sum() / max(np.nansum(np.square(velocity)), 1e-12)
-        value, error = np.append(value, none.value[2:]), np.append(error, none.error[2:])
-        return Estimate(value, np.hypot(error, [attenuation, 0.0, 0.0, 0.0, 0.0]))
+        none.value[:2], none.error[:2] = c.lasting[:, column]
+        none.error[0] = np.hypot(none.error[0], np.square(noise).sum() / max(np.nansum(np.square(velocity)), 1e-12))
+        return none
     if truth is None:
         moved, driven, turns, bends, span = moves(c, column)
         if len(moved) < LEAST_COUNT:
@@ -344,17 +343,6 @@ def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
     ends = np.column_stack([links.observer, links.neighbour])[there]
     one, other = ids[ends if directed else np.sort(ends)].T
     return pd.Series(one + (" to " if directed else " and ") + other, there)
-
-
-def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
-    """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
-    errors of the filters, which last."""
-    made, lasts, names = {}, share(c), pairs(c, k, k > 0)
-    for pair, rows in names.groupby(names).groups.items():
-        offset, error = median(c.relative[rows, k])
-        position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
-        made[str(pair)] = offset, float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
-    return made
 
 
 def lag_of_fixes(c: Check, column: int) -> float:

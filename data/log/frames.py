@@ -263,7 +263,9 @@ def assumed(
     else:
         floor = rare * of(*MOTION, default=0.0, unit="m/s")
         if not body and {"speed", "heading"} <= set(square.index):
-            floor = _across(floor, float(np.sqrt(square["heading"])), rows, dt)
+            heading = float(np.sqrt(square["heading"]))  # whose error, v^2 s_h^2 across, lasts until the next one
+            across = (only(rows, "speed")["value"] ** 2).mean() * heading**2 * _apart(rows, ["heading"], dt)
+            floor = max(floor, float(np.sqrt((floor**2 + across) / 2)))
             summary.assume(
                 f"{floor:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds"
             )
@@ -284,11 +286,3 @@ def _apart(rows: Rows, kinds: Sequence[str], dt: float) -> float:
     """Steps from one measurement of these kinds to the next, 1 at least."""
     t = only(rows, *kinds).drop_duplicates(["vehicle", "t"]).sort_values("t").groupby("vehicle")["t"]
     return float(np.fmax(t.diff().median() / dt, 1.0))
-
-
-def _across(speed: float, heading: float, rows: Rows, dt: float) -> float:
-    """Standard deviation m/s of each axis of a velocity that is a speed v turned by a measured heading: the mean of the
-    variances along, s_v^2, and across, v^2 s_h^2 n, where a heading's error lasts for the n steps to the next one; at
-    least s_v."""
-    across = (only(rows, "speed")["value"] ** 2).mean() * heading**2 * _apart(rows, ["heading"], dt)
-    return max(speed, float(np.sqrt((speed**2 + across) / 2)))

@@ -102,7 +102,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
         runs = runs_in_memory(runs, 8 * recording.broadcasts.size + 4 * len(fewer))
         recording = recording.of_runs(np.zeros(runs, dtype=np.int64))
     broadcasts, arrival = schedule(recording.ids, recording.t, fewer, v2x, recording.runs, seed)
-    broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
+    broadcasts = broadcasts & recording.present
     broadcasts[..., marks] = False
     return replace(recording, broadcasts=broadcasts, arrival=np.where(marked[kept], -1, arrival))
 

@@ -34,7 +34,7 @@ from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
 from ..librsf import is_librsf, read_librsf
-from ..nclt import is_nclt, read_nclt
+from ..nclt import FILE_NAMES, read_nclt
 from ..nmea import DAY_S, read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
@@ -305,7 +305,7 @@ def _is_bag(path: Path) -> bool:
 def _is_read(file: Path) -> bool:
     ending = file.suffix.lower()
     if ending == ".pt":
-        return is_nclt(file)
+        return file.name in FILE_NAMES
     return is_librsf(file) if ending == ".txt" and file.is_file() else ending in READERS
 
 

@@ -1,5 +1,6 @@
 """Relative measurements of a log against positions: scale, lateness, outliers, wrong partners, offsets of pairs."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pandas as pd
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
-from .estimates import LAG_STEP, LEAST_COUNT, LONGEST_LAG, MOVED_STDS, OUTLYING, SURE_ERRORS, offsets, pairs
+from .estimates import LAG_STEP, LEAST_COUNT, LONGEST_LAG, MOVED_STDS, OUTLYING, SURE_ERRORS, median, pairs, share
 from .frames import UNSTATED
 from .motion import MOVING
 from .residuals import Check, plane
@@ -66,21 +67,24 @@ def measurements(c: Check) -> list[dict[str, Any]]:
     return rows
 
 
-def of_ranges(c: Check) -> list[str]:
+def of_ranges(c: Check) -> Iterator[str]:
     """What all ranges share that positions contradict."""
     (scale, unsure), (late, error) = c.ranges
-    return [
-        f"ranges are too {'long' if scale > 0 else 'short'} by {100 * abs(scale):.2f} +- {100 * unsure:.2f} %: "
-        f"scale=range:{1 / (1 + scale):.5g} mends it."
-    ] * bool(scale) + [
-        f"ranges are {abs(late):.3f} +- {error:.3f} s {'late' if late > 0 else 'early'} beside fixes and odometry: "
-        "stamp them when they are measured."
-    ] * bool(late)
+    if scale:
+        yield (
+            f"ranges are too {'long' if scale > 0 else 'short'} by {100 * abs(scale):.2f} +- {100 * unsure:.2f} %: "
+            f"scale=range:{1 / (1 + scale):.5g} mends it."
+        )
+    if late:
+        yield (
+            f"ranges are {abs(late):.3f} +- {error:.3f} s {'late' if late > 0 else 'early'} beside fixes and odometry: "
+            "stamp them when they are measured."
+        )
 
 
-def of_measurements(c: Check) -> list[str]:
+def of_measurements(c: Check) -> Iterator[str]:
     """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
-    sentences, links = [], c.world.links
+    links = c.world.links
     for row in c.measurements:
         name, unit, number, median, std, least, should, noise, outliers = row.values()
         if number < LEAST_COUNT:
@@ -116,19 +120,19 @@ def of_measurements(c: Check) -> list[str]:
         apart = {(" to " if k else " and ").join(ends) for pair in misfits for ends in (pair, pair[:: 1 if k else -1])}
         pairs = [one for one in _named(c, k, least) if one[0] not in apart]
         if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / number) and not scaled and not misfits:
-            sentences.append(
+            yield (
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
             )
         of_pairs = misfits and (not wrong or hint == HINTS[name])
         if wrong and not of_pairs:
-            sentences.append(f"{word}s miss the positions by {stated}. {hint}")
+            yield f"{word}s miss the positions by {stated}. {hint}"
         if of_pairs:
             count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
             ends = set.intersection(*map(set, misfits))
             one = "".join(ends) if len(ends) == 1 else ""
             worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:NAMED_CASES]
-            sentences.append(
+            yield (
                 f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
                 f"{', '.join(' to '.join(pair) + misfits[pair][1] for pair in worst_of)}"
                 f"{', ...' * (len(misfits) > NAMED_CASES)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
@@ -137,7 +141,7 @@ def of_measurements(c: Check) -> list[str]:
         if pairs and (not wrong or hint == HINTS["range"]):
             shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
             offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
-            sentences.append(
+            yield (
                 f"{word}s of {shown} are off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (f"offset={offsets_text} takes it off." if word == "range" else f"offset=NAME.{word}: takes it off.")
@@ -146,11 +150,10 @@ def of_measurements(c: Check) -> list[str]:
             size, std_of = ("less", max(noise, MIN_STD_SHARE * least)) if noise < least else ("more", noise)
             unstated = name in "".join(c.log.summary.assumed.get(UNSTATED, ()))
             known, hint = ("assumed", "") if unstated else ("stated", " Were variances given as deviations?")
-            sentences.append(
+            yield (
                 f"{word}s scatter {size} than {known}, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
                 f"{known}: std={word}:{std_of:.2g}.{hint}"
             )
-    return sentences
 
 
 def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
@@ -184,13 +187,15 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
 
 
 def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
-    """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with their offsets
-    and standard errors, largest first."""
-    named = [
-        (pair, offset, error)
-        for pair, (offset, error) in offsets(c, k, stated).items()
-        if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated)
-    ]
+    """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with the medians
+    and their standard errors, largest first: by parts of the drive, and by the errors of the filters, which last."""
+    named, lasts, names = [], share(c), pairs(c, k, k > 0)
+    for pair, rows in names.groupby(names).groups.items():
+        offset, error = median(c.relative[rows, k])
+        position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
+        error = float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
+        if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated):
+            named.append((str(pair), offset, error))
     return sorted(named, key=lambda row: -abs(row[1]))
 
 

@@ -91,7 +91,7 @@ def together(log: Log) -> tuple[Log, str]:
         InputError: the vehicles share no two steps.
     """
     rec = log.recording
-    there = np.isfinite(rec.velocity[0][:, rec.vehicles, 0]).all(axis=1)
+    there = np.asarray(rec.present[:, rec.vehicles].all(axis=1))
     first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
     if last - first < 2 or not rec.vehicles:
         raise InputError(
