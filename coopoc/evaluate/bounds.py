@@ -408,7 +408,10 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
     bar = progress_bar(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0)
     with bar, one_thread():
         for t, stage in enumerate(stages):
-            cov = np.linalg.inv(_onward(cov, stage) + stage.gained)
+            _, now, _, moved = _moved(cov, stage)
+            information = np.diag(stage.prior.ravel())
+            information[np.ix_(now, now)] = np.linalg.inv(moved)  # (F P F^T + Q)^-1
+            cov = np.linalg.inv(information + stage.gained)
             bar.update()
             if smoothing:
                 filtered.append(cov)
@@ -416,7 +419,10 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
                 yield t, cov
         for t in range(len(filtered) - 1, -1, -1):
             yield t, cov
-            cov = _smoothed(filtered[t - 1], stages[t], cov) if t else cov
+            if t:
+                before, now, motion, moved = _moved(filtered[t - 1], stages[t])
+                gain = filtered[t - 1][:, before] @ motion.T @ np.linalg.inv(moved)
+                cov = filtered[t - 1] + gain @ (cov[np.ix_(now, now)] - moved) @ gain.T
             bar.update()
 
 
@@ -440,18 +446,3 @@ def _moved(cov: Floats, stage: Stage) -> tuple[Ints, Ints, Floats, Floats]:
     before, now = (np.add.outer(d * of, np.arange(d)).ravel() for of in (stage.previous[stays], stays))
     motion, process = (block_diag(*of[stays], none) for of in (stage.motion, stage.process))
     return before, now, motion, motion @ cov[np.ix_(before, before)] @ motion.T + process
-
-
-def _onward(cov: Floats, stage: Stage) -> Floats:
-    """Information about the members of a step from the covariance one step before, (F P F^T + Q)^-1."""
-    _, now, _, moved = _moved(cov, stage)
-    out = np.diag(stage.prior.ravel())
-    out[np.ix_(now, now)] = np.linalg.inv(moved)
-    return out
-
-
-def _smoothed(cov: Floats, stage: Stage, later: Floats) -> Floats:
-    """The covariance one step before that of `later`, with all that is known there."""
-    before, now, motion, moved = _moved(cov, stage)
-    gain = cov[:, before] @ motion.T @ np.linalg.inv(moved)
-    return cov + gain @ (later[np.ix_(now, now)] - moved) @ gain.T

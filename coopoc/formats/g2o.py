@@ -67,24 +67,16 @@ def read_g2o(path: str | Path, repair: bool = False) -> Graph:
     path = given_path(path)
     lines = list(read_words(path))
     records = [line for line in lines if line[1][0] not in GRAMMAR.others]
-    identity = _identities(path.name, [line for line in lines if line[1][0] == "PARAMS_SE3OFFSET"])
+    offsets = [line for line in lines if line[1][0] == "PARAMS_SE3OFFSET"]
+    poses = to_numbers(path.name, [number for number, _ in offsets], [words[2:] for _, words in offsets], OFFSET, 7)
+    identity = {words[1]: bool((pose == np.eye(7)[6]).all()) for (_, words), pose in zip(offsets, poses, strict=True)}
     for number, words in records:
-        _refuse_offset(path.name, number, words, identity)
+        record = GRAMMAR.records.get(words[0])
+        if record and record.offset and len(words) == record.width:
+            word = words[1 + len(record.ends)]
+            if not identity.get(word, False):
+                allowed = "must be the identity" if word in identity else "must be given by a line PARAMS_SE3OFFSET"
+                where = f"{path.name}: line {number}"
+                raise InputError(where, f"offset {word}", allowed, "Measure from the pose itself.")
     fixed = [(number, word) for number, words in lines if words[0] == "FIX" for word in words[1:]]
     return replace(GRAMMAR.read(path.name, records, fixed, repair), guess=True)
-
-
-def _identities(file: str, lines: list[tuple[int, list[str]]]) -> dict[str, bool]:
-    """Id of every sensor offset, and whether it is none."""
-    poses = to_numbers(file, [number for number, _ in lines], [words[2:] for _, words in lines], OFFSET, 7)
-    return {words[1]: bool((pose == np.eye(7)[6]).all()) for (_, words), pose in zip(lines, poses, strict=True)}
-
-
-def _refuse_offset(file: str, number: int, words: list[str], identity: dict[str, bool]) -> None:
-    """InputError where a measurement is made from an offset that is not given, or is not the identity."""
-    record = GRAMMAR.records.get(words[0])
-    if record and record.offset and len(words) == record.width:
-        word = words[1 + len(record.ends)]
-        if not identity.get(word, False):
-            allowed = "must be the identity" if word in identity else "must be given by a line PARAMS_SE3OFFSET"
-            raise InputError(f"{file}: line {number}", f"offset {word}", allowed, "Measure from the pose itself.")

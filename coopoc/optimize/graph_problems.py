@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import TWO_TURNS, Floats, Ints, frozen, instance, one_of
+from ..arrays import TWO_TURNS, Floats, Ints, instance, one_of
 from ..errors import InputError
 from ..formats import load_graph
 from ..formats.graph import Graph
@@ -86,7 +86,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     first = "odometry" if start in ("auto", "incremental") else start
     start_x = _x0(graph, poses, first)
     problem = Problem(graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
-    problem = problem.replace_unchecked(x0=frozen(directed(problem, start_x)))
+    problem = problem.starting_at(directed(problem, start_x))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
         notes.append(
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
@@ -99,7 +99,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         problem, won = _raced(graph, problem)
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
-        problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
+        problem, won = problem.starting_at(x0), Search(start, steps)
     if won.start.startswith("file") and not graph.guess:
         notes.append("the start is the file's vertices, which may be the truth")
     search = won._replace(seconds=clock() - began, notes=(*notes, *won.notes), x0=problem.x0)
@@ -135,7 +135,7 @@ def started(problem: Problem, end: Floats | None = None) -> Problem:
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
-        at = problem.replace_unchecked(x0=frozen(directed(problem, _x0(graph, problem.poses, "odometry"))))
+        at = problem.starting_at(directed(problem, _x0(graph, problem.poses, "odometry")))
         at, won = _raced(graph, at, True, end)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, instance, number
+from ..arrays import Floats, checked, instance, named, number
 from ..errors import InputError, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
@@ -60,11 +60,10 @@ class Incremental:
             InputError: a name that is known already or unknown, a measurement that GTSAM has no factor for, a new pose
                 that nothing holds; the estimate is as before.
         """
-        space, first, new = self._problem.space, len(self.names), dict(values or {})
+        space, first = self._problem.space, len(self.names)
+        new = named("values", values or {}, "Give names of nodes.")
         d, x, late_poses = space.dimension, np.zeros((len(new), space.ambient)), set()
         for k, (name, value) in enumerate(new.items()):
-            if not isinstance(name, str):
-                raise InputError("values", shown(name), "must have names of nodes", "Give a str.")
             if name in self._place:
                 raise InputError("values", repr(name), "must be a new node", "Give guesses of new nodes alone.")
             vector = checked("values", value).ravel()

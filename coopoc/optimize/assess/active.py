@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints
+from ...arrays import Floats, Ints
 from ..model.factor import as_factor, bounded, stacked
 from ..model.problem import Problem, linearised
 
@@ -87,6 +87,8 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     Multipliers are the least-squares ones with the signs that a minimum needs; an inequality that does not push does
     not hold. Constraints that share no direction are looked at apart from each other.
     """
+    from scipy.optimize import lsq_linear
+
     rows = constraint_rows(problem, x)
     length = np.sqrt(rows.matrix.power(2).sum(axis=1))
     reach = ACTIVE_STEP * length
@@ -96,8 +98,10 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     own_columns, along, exact = [], [], []
     for members, columns, block in _apart(rows.matrix[touched]):
         own = touched[members]
-        unit = block / length[own, None]
-        of_active = _multipliers(unit, gradient.ravel()[columns], low[own] | equal[own], high[own] | equal[own])
+        unit, pull = block / length[own, None], gradient.ravel()[columns]
+        scale = max(np.abs(pull).max(), 1e-300)
+        bounds = np.where((low | equal)[own], -np.inf, 0.0), np.where((high | equal)[own], np.inf, 0.0)
+        of_active = scale * lsq_linear(unit.T, -pull / scale, bounds, method="bvls", tol=1e-14).x
         multipliers[own] = of_active / length[own]
         pushes = equal[own] | (of_active != 0)
         gap = (rows.value - np.where(multipliers < 0, rows.lower, rows.upper))[own] / length[own]
@@ -120,16 +124,6 @@ def _apart(matrix: Any) -> Iterator[tuple[Ints, Ints, Floats]]:
         part = matrix[members]
         columns = np.unique(part.indices)
         yield members, columns, part[:, columns].toarray()
-
-
-def _multipliers(unit: Floats, gradient: Floats, low: Bools, high: Bools) -> Floats:
-    """Least |gradient + unit^T m| with m <= 0 where only the lower bound is near and m >= 0 where only the upper is."""
-    from scipy.optimize import lsq_linear
-
-    scale = max(np.abs(gradient).max(), 1e-300)
-    bounds = (np.where(low, -np.inf, 0.0), np.where(high, np.inf, 0.0))
-    solution = lsq_linear(unit.T, -gradient / scale, bounds, method="bvls", tol=1e-14)
-    return np.asarray(scale * solution.x)
 
 
 def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:

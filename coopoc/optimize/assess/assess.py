@@ -233,7 +233,7 @@ def _unobservable(
         lost, curved = ~measured[moving], abs(hessian).sum(axis=0) > 0
         every = np.zeros((J.shape[1], len(null)))
         every[measured] = null.T / length[measured, None]
-        own = np.eye(len(moving))[:, lost & curved] if (lost & curved).any() else np.zeros((len(moving), 0))
+        own = np.arange(len(moving))[:, None] == np.flatnonzero(lost & curved)
         basis = np.linalg.qr(np.hstack([scale[:, None] * every[moving], own]))[0]
         values, turned = np.linalg.eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
         moves = np.zeros(J.shape[1])

@@ -230,6 +230,10 @@ class Problem:
                 changed.__dict__[name] = kept[name]
         return changed
 
+    def starting_at(self, x0: Floats) -> "Problem":
+        """The problem from another x0 (n, ambient), which need not be checked."""
+        return self.replace_unchecked(x0=frozen(x0))
+
     def linearise(self, x: npt.ArrayLike) -> Linear:
         """Whitened residuals and derivatives at x (n, ambient)."""
         return linearise(self.space, self.factors, self.movable, self._at(x))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, Ints, frozen
+from ...arrays import Floats, Ints
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
@@ -90,7 +90,7 @@ def contest(
         finish: from where a start leads to a minimum of the cost.
         cost: that is to be least.
     """
-    x = inner(marked.problem.replace_unchecked(x0=frozen(start)))
+    x = inner(marked.problem.starting_at(start))
     graduation = graduate(marked, inner, x, first_mu(float((marked.squares(x) / marked.bound).max())))
     huber, cauchy, truncated = (softened(marked, name) for name in ("huber", "cauchy", "truncated"))
 
@@ -102,10 +102,10 @@ def contest(
             return end
 
         def soft(at: Floats) -> Floats:
-            return inner(cauchy.replace_unchecked(x0=frozen(at)))
+            return inner(cauchy.starting_at(at))
 
         starts = {"graduated": graduation.x, "x0": start, "cauchy": soft(start)}
-        starts["huber"] = soft(inner(huber.replace_unchecked(x0=frozen(start))))
+        starts["huber"] = soft(inner(huber.starting_at(start)))
         ends = {name: landed(at) for name, at in starts.items()}
         costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
         best = min(ends, key=costs.__getitem__)
@@ -189,11 +189,10 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
         marked,
         inner,
         start,
-        lambda at: inner(problem.replace_unchecked(x0=frozen(at))),
+        lambda at: inner(problem.starting_at(at)),
         sparse(problem).cost,
     )
     name = search.start if best == "x0" and search.start else best
-    return problem.replace_unchecked(
-        x0=frozen(x),
+    return problem.starting_at(x).replace_unchecked(
         search=search._replace(start=name, iterations=search.iterations + steps, notes=(*search.notes, *notes)),
     )

@@ -148,17 +148,12 @@ def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
     return space.join(moved, turn @ space.rotation(nodes))
 
 
-def _outward(ranges: Ranges, body: Ints) -> tuple[Ints, Ints, Ints]:
-    """Rows of the ranges with weight from a body to what is not of it, their nodes of it and the others."""
-    inside = np.isin(ranges.nodes, body)
-    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))
-    return rows, ranges.nodes[rows][inside[rows]], ranges.nodes[rows][~inside[rows]]
-
-
 def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
     """Other places of a body: it is reflected at the best-fit plane of what ranges it, and a point is put where its
     spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image."""
-    space, x, (rows, own, other) = ranges.problem.space, ranges.x, _outward(ranges, body)
+    space, x, inside = ranges.problem.space, ranges.x, np.isin(ranges.nodes, body)
+    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))  # to what is not of it
+    own, other = ranges.nodes[rows][inside[rows]], ranges.nodes[rows][~inside[rows]]
     if len(rows) < 2 and not (len(rows) and space.dimension == 3):
         return []
     at, places, index = space.position(x[body]), space.position(x[other]), np.searchsorted(body, own)

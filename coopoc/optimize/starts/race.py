@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ...arrays import Floats, Ints, frozen
+from ...arrays import Floats, Ints
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
@@ -86,9 +86,12 @@ def race(
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         return end
 
+    def least_of_all() -> float:
+        return min(cost for cost, _ in tried.values())
+
     def follow(name: str, x: Floats) -> Floats:
         nonlocal taken
-        y, steps = late.pop(name)(problem.replace_unchecked(x0=frozen(x)))
+        y, steps = late.pop(name)(problem.starting_at(x))
         y, taken = descend(y), taken + steps
         tried[name] = system.cost(y), y
         return y
@@ -112,7 +115,7 @@ def race(
         costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
         ends += [*others, *((each, x) for each in minima)]
         notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
-        return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
+        return problem.starting_at(x), Search(name, taken, notes=notes)
 
     relative = all(f.measurement.compares_poses for f in problem.factors)
     relative = relative and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
@@ -128,18 +131,18 @@ def race(
                 name, x = next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost)
                 return ended(name, x, True)
             straight |= {name} if end.converged else set()
-    if grown in late and not straight and min(cost for cost, _ in tried.values()) > NEAR_COST * limit:
+    if grown in late and not straight and least_of_all() > NEAR_COST * limit:
         y = follow(grown, np.asarray(problem.x0))
         if explained(y):
             return ended(grown, y)
     for name in rough:
         attempt(name, tried[name][1], FIRST_STEPS)
-    least = min(cost for cost, _ in tried.values())
+    least = least_of_all()
     close = {name: x for name, (cost, x) in tried.items() if cost <= NEAR_COST * least}
     if max(tried[name][0] for name in close) > (1.0 + SAME_COST) * least:
         ends = [attempt(name, x, LATER_STEPS) for name, x in close.items()]
         minima = [tried[name][0] for name, end in zip(close, ends, strict=True) if end.converged]
-        least = min(cost for cost, _ in tried.values())
+        least = least_of_all()
     name, *others = (name for name, (cost, _) in tried.items() if cost <= (1.0 + SAME_COST) * least)
     x = tried[name][1]
     if name not in straight and not explained(x) and not others:
