@@ -20,12 +20,8 @@ from .evaluate.pictures import plot_solution as plot_solution
 from .evaluate.pictures import plot_track as plot_track
 from .evaluate.statistics import paired_difference as paired_difference
 from .formats.trajectories import write_tum as write_tum
-from .methods.baselines import LKFSA as LKFSA
-from .methods.baselines import MSMV as MSMV
 from .methods.batch_smoother import BatchSmoother as BatchSmoother
 from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
-from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
-from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
 from .methods.kalman import Kalman as Kalman
 from .methods.noise_model import NoiseModel as NoiseModel
@@ -34,6 +30,10 @@ from .methods.poses.pose_filter import pose_start as pose_start
 from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
 from .methods.star import stars as stars
+from .methods.star_filters import LKFSA as LKFSA
+from .methods.star_filters import MSMV as MSMV
+from .methods.star_filters import CovarianceIntersection as CovarianceIntersection
+from .methods.star_filters import JointFilter as JointFilter
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
 from .methods.star_stream import StarStream as StarStream
 from .methods.track import Method as Method

@@ -211,7 +211,7 @@ def bound_rows(p: Params) -> list[Row]:
 
 def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
     """Name, times s and positions m of each ego's path in each run, as the cell's method estimates it."""
-    from coopoc.methods.gaps import follow
+    from coopoc.methods.track import follow
 
     recording = scene.recording(p)
     for seed, method in methods(p) if p["method"] != "bound" else ():

@@ -11,9 +11,9 @@ from coopoc import V2X, Fleet, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import nees
 from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
-from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.star import stars
+from coopoc.methods.star_filters import CovarianceIntersection
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()

@@ -13,11 +13,10 @@ from ..workers import progress_bar
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import Message
 from .doubts import doubts
-from .gaps import in_stretches
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
 from .odometry_fault import with_odometry
-from .track import Checked, Track
+from .track import Checked, Track, in_stretches
 
 if TYPE_CHECKING:
     from ..optimize import Problem
@@ -156,7 +155,7 @@ def gated(problem: "Problem") -> "Problem":
 
 def centre(recording: Recording, upload: Message) -> tuple[Floats, Floats]:
     """Bytes (R, N) over the drive that every vehicle receives of a centre's answers, and sends of its `upload`."""
-    links, overhead, present = recording.links, recording.v2x.overhead, np.isfinite(recording.velocity[0, :, :, 0])
+    links, overhead, present = recording.links, recording.v2x.overhead, recording.present
     measured = np.zeros(present.shape, dtype=np.int64)
     np.add.at(measured, (links.step, links.observer), 1)
     sent = (present * upload.size(overhead, measured)).sum(axis=0, dtype=float)
@@ -189,7 +188,7 @@ def located(recording: Recording) -> Bools:
 
     A vehicle that has no fix yet has no position to linearise at: until then it takes no part.
     """
-    present = np.isfinite(recording.velocity[0, :, :, 0])
+    present = recording.present
     before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
     joined = last_true(present & ~before)
     fix = last_true(np.isfinite(recording.gnss).all(axis=-1), axis=1)

@@ -4,12 +4,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from ..plugins import find, in_file, names
-from .baselines import LKFSA, MSMV
 from .batch_smoother import BatchSmoother
 from .cooperative_filter import CooperativeFilter
-from .covariance_intersection import CovarianceIntersection
-from .joint_filter import JointFilter
 from .kalman import GNSS, Kalman
+from .star_filters import LKFSA, MSMV, CovarianceIntersection, JointFilter
 from .track import Method
 
 Factory = Callable[..., Method]

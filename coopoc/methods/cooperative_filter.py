@@ -17,10 +17,9 @@ from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
-from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .odometry_fault import with_odometry
-from .track import Checked, Track
+from .track import Checked, Track, in_stretches
 
 FOUND_UNITS = {
     "heading error": "rad",

@@ -14,9 +14,8 @@ from ..workers import progress_bar
 from ..world.inbox import Inbox, inbox
 from ..world.recording import UNLIKELY, Recording, Vehicles, check_recording
 from .doubts import doubts
-from .gaps import needs_fix
 from .noise_model import NoiseModel
-from .track import Method, Track
+from .track import Method, Track, needs_fix
 
 
 class Estimate(NamedTuple):

@@ -15,11 +15,10 @@ from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..text import short_repr
 from ..world.recording import Recording, Vehicles, check_recording
 from .doubts import doubts
-from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .odometry_fault import with_odometry
 from .stream import FilterStream
-from .track import Alone, Checked, Track
+from .track import Alone, Checked, Track, in_stretches
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from coopoc.evaluate.metrics import max_error, rt_le
-from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.kalman import GNSS, Kalman
+from coopoc.methods.star_filters import JointFilter
 from coopoc.study.results import Results
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table, pivot

@@ -19,8 +19,7 @@ from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..batch_smoother import CENTRE, centre
 from ..doubts import doubts
-from ..gaps import noted
-from ..track import Track
+from ..track import Track, noted
 from .pose_inputs import (
     POSE,
     SPREAD,

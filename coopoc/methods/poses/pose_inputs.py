@@ -36,7 +36,7 @@ def body_of(recording: Recording) -> Body:
 
 def present(recording: Recording) -> Bools:
     """(T, N) whether a vehicle is there; landmarks are not."""
-    there = np.isfinite(recording.velocity[0, :, :, 0])
+    there = recording.present
     there[:, list(recording.landmarks)] = False
     return there
 

@@ -174,7 +174,9 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     rows = np.flatnonzero(np.isfinite(recording.relative[0, links, 0]))
     at, first = np.unique(places[rows], axis=0, return_index=True)
     if not len(at) or np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), LINE_WIDTH) < 2:
-        raise _too_little(recording, column)
+        actual = f"{recording.ids[column]} has no fix and sees too little in {recording.t[-1] - recording.t[0]:g} s"
+        allowed = "a fix, or a range and bearing or three ranges, of landmarks or vehicles whose poses are found"
+        raise InputError("seconds", actual, f"must hold {allowed}", "Take more seconds, or give its pose.")
     steps = recording.links.step[links[rows]]
     early = steps <= steps[first.max()] + RANGE_SECONDS / recording.dt
     rows, steps = rows[early], steps[early]
@@ -183,9 +185,3 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
     position = (np.linalg.pinv(matrix) @ right[..., None])[:, :2, 0]
     return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
-
-
-def _too_little(recording: Recording, column: int) -> InputError:
-    actual = f"{recording.ids[column]} has no fix and sees too little in {recording.t[-1] - recording.t[0]:g} s"
-    allowed = "must hold a fix, or a range and bearing or three ranges, of landmarks or vehicles whose poses are found"
-    return InputError("seconds", actual, allowed, "Take more seconds, or give its pose.")
