@@ -16,11 +16,6 @@ FIELDS = {"filtered_gps": 2, "filtered_wheel": 2, "imu_sensor": 3, "theta_gt": 1
 """Field of a drive, a row for each second -> columns that are read."""
 
 
-def is_nclt(path: Path) -> bool:
-    """Whether a file has the name of one of these."""
-    return path.name in FILE_NAMES
-
-
 def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
     """Rows of two vehicles for each drive: fixes (x, y), speed as the mean of both wheels, the truth, and the heading:
     that of the inertial unit, or the true one, DATE and DATE-true-heading. Every drive begins at 0 s.
