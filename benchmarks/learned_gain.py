@@ -17,9 +17,8 @@ from timing import report
 from torch import Tensor
 
 import coopoc as co
-from coopoc.learned.nets.gain import Recurrent
+from coopoc.learned.nets.gain import Recurrent, flatten
 from coopoc.learned.nets.gain_net import GainNet
-from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Segments, clients
 from coopoc.learned.training.fit import descend
 from coopoc.learned.training.machine import one_core

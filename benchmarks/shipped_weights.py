@@ -16,7 +16,7 @@ from coopoc.data.registry import load_fleet
 from coopoc.errors import unknown
 from coopoc.evaluate.metrics import nees, rt_le, share_of_average
 from coopoc.learned.checkpoint import Checkpoint, load, save
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of
 from coopoc.learned.train import trained
 from coopoc.methods.kalman import Kalman

@@ -21,8 +21,7 @@ from coopoc.paths import given_path
 from coopoc.plugins import find, in_file, path_of, points
 from coopoc.text import short_repr
 
-from .nets.gain import Gain
-from .nets.stack import unflatten
+from .nets.gain import Gain, unflatten
 
 _HISTORY, CHECKSUM = "history", "checksum"
 

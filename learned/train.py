@@ -20,9 +20,8 @@ from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federate import federate
-from .nets.gain import Gain
+from .nets.gain import Gain, flatten
 from .nets.okf import NoiseParameters
-from .nets.stack import flatten
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of

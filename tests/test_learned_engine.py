@@ -13,8 +13,7 @@ from torch import Tensor
 from coopoc.learned import GainNet
 from coopoc.learned.engine.layers import sigmoid, tanh
 from coopoc.learned.engine.optimiser import Moments, Update
-from coopoc.learned.nets.gain import Gain, Recurrent
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import Gain, Recurrent, flatten
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core
 

@@ -10,7 +10,7 @@ from shell import python
 from test_extend import blocks, commands, shell
 
 from coopoc.learned import Checkpoint, load, save
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.recipes import recipe_of
 from coopoc.plugins import find
 

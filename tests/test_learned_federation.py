@@ -28,8 +28,7 @@ from coopoc.learned.federation.rules import (
     TrimmedMean,
     rule,
 )
-from coopoc.learned.nets.gain import Gain
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import Gain, flatten
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.fit import Judge
 from coopoc.methods.track import Method

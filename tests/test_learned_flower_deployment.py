@@ -27,7 +27,7 @@ from test_learned_flower import pytestmark as flower
 from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.learned import load
-from coopoc.learned.federation.local import adapt
+from coopoc.learned.federation.federate import adapt
 from coopoc.learned.flower.job import job_of
 from coopoc.learned.recipes import Job, job_clients, untrained
 

@@ -23,7 +23,7 @@ from coopoc.learned import (
     train_all,
 )
 from coopoc.learned.checkpoint import read_card
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.recipes import RECIPES
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.drives import MeasuredDrives

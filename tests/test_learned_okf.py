@@ -14,8 +14,8 @@ from test_learned_measured import walk
 from coopoc import Fleet, Sensors, observe
 from coopoc.evaluate.metrics import nees
 from coopoc.learned import NoiseParameters, OptimisedKF, clients
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.nets.okf import scan
-from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.fit import Judge
 from coopoc.learned.training.okf_fit import fit_okf

@@ -25,7 +25,7 @@ from coopoc.learned import (
     train_all,
 )
 from coopoc.learned.checkpoint import read_card, write
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import flatten
 
 
 def drives() -> Fleet:

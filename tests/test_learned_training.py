@@ -10,8 +10,7 @@ from conftest import refused, winding, without
 import coopoc.learned.training.fit as train
 from coopoc import Fleet, Sensors
 from coopoc.learned import GainNet, Schedule, Segments, clients, federate, fit
-from coopoc.learned.nets.gain import Recurrent
-from coopoc.learned.nets.stack import flatten
+from coopoc.learned.nets.gain import Recurrent, flatten
 from coopoc.learned.training.clients import mirrored
 from coopoc.learned.training.schedule import cosine
 

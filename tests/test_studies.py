@@ -16,8 +16,8 @@ from coopoc.data.fleet_files import write_table
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.nets.gain_net import GainNet
-from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of, load_method
 from coopoc.plugins import find
 from coopoc.studies import convergence, error_cdf, lineup, scene, weights

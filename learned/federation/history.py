@@ -15,8 +15,7 @@ from coopoc.arrays import instance, number
 from coopoc.evaluate.ledger import of_training
 from coopoc.text import short_repr
 
-from ..nets.gain import Gain
-from ..nets.stack import unflatten
+from ..nets.gain import Gain, unflatten
 from .combine import SERVER
 
 AGREEMENT = 0.1

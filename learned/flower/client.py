@@ -11,7 +11,7 @@ import torch
 
 from coopoc import InputError, MissingLibraryError, load_fleet, read_log
 
-from ..federation.local import adapt
+from ..federation.federate import adapt
 from ..recipes import Job, job_clients, untrained
 from ..training.clients import Client
 from ..training.drives import drives_of

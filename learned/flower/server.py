@@ -20,8 +20,7 @@ from ..checkpoint import Checkpoint, read_card, save
 from ..federation.combine import SERVER, screen, too_few
 from ..federation.history import Federation, Round
 from ..federation.rules import rule
-from ..nets.gain import Gain
-from ..nets.stack import flatten
+from ..nets.gain import Gain, flatten
 from ..recipes import Job, untrained
 from .client import require_flower
 from .job import job_of

@@ -12,11 +12,12 @@ of a batch is NaN where there is no truth; `squared_error` and `over_time` leave
 Arguments of the constructor that are kept as attributes of the same name make the net again from a checkpoint.
 """
 
+import copy
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -28,7 +29,8 @@ from coopoc.arrays import Floats, number
 from ..engine.optimiser import Moments, Outcome, Update, advance
 from ..method import LearnedGain
 from ..training.clients import Batch, Segments
-from .stack import named
+
+Net = TypeVar("Net", bound=nn.Module)
 
 
 class Gain(nn.Module, ABC):
@@ -167,3 +169,32 @@ def over_time(values: Tensor, counted: Tensor) -> Tensor:
     if there.all():
         return rows.mean(-1)
     return torch.where(there, rows, 0.0).sum(-1) / there.sum(-1).clamp(min=1)
+
+
+def flatten(models: Sequence[nn.Module]) -> Tensor:
+    """(S, P) weights of S models of one shape, in the order of `parameters()`.
+
+    >>> flatten([nn.Linear(2, 3), nn.Linear(2, 3)]).shape
+    torch.Size([2, 9])
+    """
+    return torch.stack([nn.utils.parameters_to_vector(m.parameters()).detach() for m in models])
+
+
+def unflatten(weights: Tensor, like: Net) -> Net:
+    """A new model shaped as `like` with the weights (P,)."""
+    model = copy.deepcopy(like)
+    nn.utils.vector_to_parameters(weights.detach().clone(), model.parameters())
+    return model
+
+
+def named(theta: Tensor, like: nn.Module) -> dict[str, Tensor]:
+    """Views (S, ...) into flat weights, or gradients, (S, P) by the names of the parameters of `like`.
+
+    >>> named(torch.zeros(4, 9), nn.Linear(2, 3))["weight"].shape
+    torch.Size([4, 3, 2])
+    """
+    views, at = {}, 0
+    for name, parameter in like.named_parameters():
+        views[name] = theta[:, at : at + parameter.numel()].view(len(theta), *parameter.shape)
+        at += parameter.numel()
+    return views

@@ -15,8 +15,7 @@ from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 from ..engine.optimiser import Moments, Update
-from ..nets.gain import Gain
-from ..nets.stack import flatten, unflatten
+from ..nets.gain import Gain, flatten, unflatten
 from .clients import Batch, Segments, mirrored
 from .machine import one_core, watched
 from .schedule import Schedule, cosine, generator

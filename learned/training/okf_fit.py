@@ -58,8 +58,10 @@ def fit_okf(
         _loss(like, logs, *data).backward()
         adam.step()
         fall.step()
-    with torch.no_grad():
-        made = like.with_logs(best.view(3, 3) + _calibration(like.stds(best), *data))
+    with torch.no_grad():  # the factor per axis that gives the normalised innovations unit variance
+        normalised, share = scan(like.stds(best), data[0])[1], data[1][..., None]
+        factor = log_scale((over_time(normalised.square(), normalised.isfinite()) * share).sum(1))
+        made = like.with_logs(best.view(3, 3) + factor)
     return made, {"validation_loss": tuple(history), "seconds": time.perf_counter() - began}
 
 
@@ -72,9 +74,3 @@ def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
 def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
     """(1,) mean over pieces and time of the squared error, m^2."""
     return (like.losses(logs, batch) * weight).sum(1)
-
-
-def _calibration(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
-    """(1, 3) logarithm of the factor per axis that gives the normalised innovations unit variance."""
-    normalised = scan(numbers, batch)[1]
-    return log_scale((over_time(normalised.square(), normalised.isfinite()) * weight[..., None]).sum(1))
