@@ -22,7 +22,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'coopoc' has no attribute {name!r}")
     try:
-        return getattr(importlib.import_module(_HOME[name], __name__), name)
+        value = globals()[name] = getattr(importlib.import_module(_HOME[name], __name__), name)
+        return value
     except ModuleNotFoundError as error:
         from .errors import missing
 

@@ -9,6 +9,7 @@ is a Point2/3, a pose a Pose2/3.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import cycle
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -95,7 +96,8 @@ def forms(problem: Problem) -> list[Form]:
 def _form(problem: Problem, factor: Factor) -> Form:
     if factor.kind not in FORMS:
         return None
-    kinds = set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist()))
+    posed = which_turn(problem)
+    kinds = {tuple([posed[i] for i in row]) for row in factor.nodes.tolist()}
     shared = factor.std is not None and len(factor.std) == 1
     parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
     if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
@@ -251,14 +253,12 @@ def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None
             graph.add(gtsam.CustomFactor(model, nodes, error(k, row, nodes)))
     for factor, form in zip(problem.factors, parts, strict=True):
         for part in form or ():
-            roots = np.broadcast_to(part.root, (len(factor.nodes), *part.root.shape[1:]))
-            for nodes, arguments, root in zip(factor.nodes.tolist(), part.arguments, roots, strict=True):
+            for nodes, arguments, root in zip(factor.nodes.tolist(), part.arguments, cycle(part.root), strict=False):
                 model = _model(root.tobytes(), len(root), factor.loss)
-                if tuple([posed[i] for i in nodes]) not in part.names:
-                    nodes = nodes[::-1]  # such as a range from a point to a pose
-                made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
+                if (turning := tuple([posed[i] for i in nodes])) not in part.names:
+                    nodes, turning = nodes[::-1], turning[::-1]  # such as a range from a point to a pose
                 if model is not None:
-                    graph.add(made(*[keys[i] for i in nodes], *arguments, model))
+                    graph.add(getattr(gtsam, part.names[turning])(*[keys[i] for i in nodes], *arguments, model))
     for i in problem.fixed:
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
         graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, np.asarray(problem.x0)[i], posed[i])))

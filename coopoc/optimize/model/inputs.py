@@ -8,7 +8,6 @@ import numpy.typing as npt
 from ...arrays import Floats, Ints, checked, frozen, refuse
 from ...errors import InputError
 from .measurements import Measurement
-from .space import Space
 
 
 def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
@@ -37,6 +36,7 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
 
 
 @lru_cache(maxsize=256)
+@lru_cache
 def fitting(measurement: Measurement, width: int) -> int | None:
     """The dimension whose z has `width` numbers; None if both have; InputError if none has."""
     widths = {d: measurement.width(d) for d in (2, 3) if d == 3 or measurement.plane is not None}
@@ -55,7 +55,8 @@ def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
         hint = "Give one row per measurement."
         raise InputError("nodes", array.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
     refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
-    if measurement.arity > 1 and (same := (np.diff(np.sort(array)) == 0).any(axis=1)).any():
+    ordered = np.sort(array)
+    if (same := (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)).any():
         hint = "A vehicle does not measure itself."
         raise InputError("nodes", array[same][0].tolist(), "must be different points", hint)
     return array
@@ -88,7 +89,7 @@ def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floa
     hint = "Drop the measurement, or give it std = inf and any finite z."
     refuse(field, array, ~np.isfinite(array), "must be finite", hint)
     if measurement.compares_poses:
-        check_rotations(field, Space(dimension, has_rotation=True).rotation(array))
+        check_rotations(field, array[:, dimension:].reshape(-1, dimension, dimension))
         return array
     for column, kept in zip(array.T, measurement.kept(dimension), strict=False):
         component = measurement.components[kept]
