@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES, sparse
 from .assess.active import constraint_rows
-from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
+from .assess.assess import Assessment, assess, held, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, SolverResult, require_backend
 from .descent.levenberg_marquardt import arrive
 from .graph_problems import started
@@ -140,7 +140,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     search = problem.search
     solved = clock()
     x, iterations = result.x, result.iterations
-    truth = assess(problem, x, covariance)
+    quick = not (covariance or constraints or problem.linear)
+    truth = (held(problem, x) if quick else None) or assess(problem, x, covariance)
     status = Status.INFEASIBLE if result.infeasible else _status(problem, x, truth)
     extras = dict(result.extras)
     if search.start:
@@ -272,7 +273,7 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
         return Status.FAILED
     if truth.active is not None:
         return Status.SOLVED if is_constrained_minimum(problem, x, truth.active) else Status.SADDLE
-    left = newton_decrease(problem, x)
+    left = truth.predicted if truth.newton else newton_decrease(problem, x)
     if left is None:
         return Status.SADDLE
     return Status.SOLVED if left <= max(DECREASE * max(truth.cost, 1.0), NEWTON_DECREASE * still) else Status.FAILED

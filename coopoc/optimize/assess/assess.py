@@ -55,6 +55,7 @@ class Assessment:
         active: what holds x, None without constraints.
         predicted: decrease of the cost by this step, as its model predicts; infinite where constraints hold it.
         curved: J^T J hardly sees some direction, and the exact Hessian, which does, stands in for it.
+        newton: the step is Newton's, by an exact Hessian that is positive definite.
     """
 
     cost: float
@@ -65,6 +66,7 @@ class Assessment:
     active: Active | None = None
     predicted: float = np.inf
     curved: bool = False
+    newton: bool = False
 
     @property
     def violation(self) -> float:
@@ -99,6 +101,24 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
         return Assessment(linear.cost, size, unknown, np.nan, _unobservable(problem, J, active), active)
     cov = cov * ~(still[:, :, None] | still[:, None, :])
     return Assessment(linear.cost, size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
+
+
+def held(problem: Problem, x: Floats) -> Assessment | None:
+    """The assessment without a covariance of a problem without constraints at x (n, ambient), by one factorisation;
+    None where the exact Hessian alone does not tell that x is held."""
+    system = sparse(problem)
+    cost, gradient, values = system.quadratic(x, "newton")
+    if not np.isfinite(values).all() or not system.cholesky.factor(values):
+        return None
+    if not (
+        _largest(problem, system.entries, values[system.entries.diagonal]) < INFLATION * system.cholesky.pivots
+    ).all():
+        return None
+    step = system.cholesky.solve(gradient)
+    none, far = np.full((len(x), *(problem.space.dof,) * 2), np.nan), float(np.abs(step).max(initial=0.0))
+    return Assessment(
+        cost, float(np.linalg.norm(gradient)), none, far, predicted=0.5 * float(gradient @ step), newton=True
+    )
 
 
 def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool) -> Assessment:

@@ -40,6 +40,9 @@ LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 HESSIAN_SHARE = 1e-3
 """Share of the cost from which on the exact Hessian makes the last steps."""
+NEXT_STEP, NEXT_TOLERANCES = 1e-7, 10.0
+"""m or rad, and tolerances, that Newton's next step may have if it shrinks as the last did: it shrinks by the square.
+"""
 HIDDEN_STEPS = 12
 """In a row, that end the loop: damping has fallen from FIRST_DAMPING to none, or the matrix is singular without."""
 
@@ -94,7 +97,7 @@ def arrive(
     step = step or factored
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
-    converged, still = False, 0
+    converged, still, before, next_step = False, 0, 0.0, min(NEXT_STEP, NEXT_TOLERANCES * tolerance)
     cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
         while len(record) < max_iterations and not converged and mu < 1e12:  # no step can help
@@ -122,7 +125,8 @@ def arrive(
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
             after = trial[0]
-            small = np.abs(dx).max(initial=0.0) <= tolerance
+            length = float(np.abs(dx).max(initial=0.0))
+            small, swift = length <= tolerance, model == "newton" and not mu and not bounded
             hidden = predicted <= HIDDEN * cost and (after <= cost * (1.0 + 1e-13) or (small and bounded))
             gain = 1.0 if hidden else (cost - after) / abs(predicted)
             still = still + 1 if hidden else 0
@@ -130,6 +134,8 @@ def arrive(
             converged = (hidden and small) or (
                 not bounded and (predicted <= ROUNDED_SHARE * max(cost, 1.0) or still > HIDDEN_STEPS)
             )
+            converged |= swift and abs(gain - 1.0) < MISMATCH and length * length <= next_step * before
+            before = length
             if not gain > 0.0:
                 corrected = None if mu or smooth or bounded or model == "newton" else _corrected(system, there)
                 kept = -np.inf if corrected is None else (cost - system.cost(corrected)) / predicted
