@@ -145,13 +145,26 @@ class Study:
         for name, value in changes.items():
             if name in settings:
                 settings[name] = parse(name, value, settings[name])
-            elif name in axes:
-                grid = _narrow(grid, name, value, axes[name])
-            else:
+                continue
+            if name not in axes:
                 raise unknown("setting", name, [*settings, *axes])
+            usual = axes[name]
+            wanted = [parse(name, v, None if None in usual else next(iter(usual), None)) for v in entries(value)]
+            if isinstance(grid, Mapping):
+                grid = {**grid, name: wanted}
+            elif other := [v for v in wanted if v not in usual]:
+                allowed = f"must be among {usual}"
+                raise InputError(name, repr(other[0]), allowed, "The grid of this study is a fixed list.")
+            else:
+                grid = [p for p in grid if name in p and p[name] in wanted]
         changed = replace(self, settings=settings, grid=grid)
+        if not isinstance(grid, Mapping):
+            return changed
         for name in changes.keys() - settings.keys():
-            _check_used(changed, name, axes[name])
+            used = _used(changed, name) or _used(replace(changed, grid={**grid, name: axes[name]}), name)
+            if used and (idle := [value for value in grid[name] if value not in used]):
+                hint = f"Write {name}={','.join(map(str, used))}."
+                raise InputError(name, repr(idle[0]), "leads to no cell under these settings", hint)
         return changed
 
 
@@ -225,27 +238,6 @@ def points(study: Study) -> list[Mapping[str, Scalar]]:
     return [p for p in grid if study.where({**study.settings, **p})]
 
 
-def _check_used(study: Study, name: str, usual: Sequence[Scalar]) -> None:
-    """InputError for a value on an axis that leads to no cell, where another or a usual one does."""
-    if not isinstance(study.grid, Mapping):
-        return
-    used = _used(study, name) or _used(replace(study, grid={**study.grid, name: usual}), name)
-    for value in study.grid[name]:
-        if used and value not in used:
-            hint = f"Write {name}={','.join(map(str, used))}."
-            raise InputError(name, repr(value), "leads to no cell under these settings", hint)
-
-
 def _used(study: Study, name: str) -> list[Scalar]:
     """Values of an axis that lead to cells."""
     return list(dict.fromkeys(p[name] for p in points(study)))
-
-
-def _narrow(grid: Any, name: str, value: Any, values: Sequence[Scalar]) -> Any:
-    wanted = [parse(name, v, None if None in values else next(iter(values), None)) for v in entries(value)]
-    if isinstance(grid, Mapping):
-        return {**grid, name: wanted}
-    for v in wanted:
-        if v not in values:
-            raise InputError(name, repr(v), f"must be among {values}", "The grid of this study is a fixed list.")
-    return [p for p in grid if name in p and p[name] in wanted]

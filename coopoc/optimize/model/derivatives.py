@@ -15,7 +15,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from .factor import LOSSES, Factor, Loss, stacked
+from .factor import LOSSES, Factor, Loss
 from .measurements import CONVERTED, Measurement, converted_rows
 from .space import Space
 
@@ -351,9 +351,15 @@ class Linear:
 
 def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats) -> Linear:
     """Factors around x (n, ambient); what is not `movable` (n, dof) has no derivative."""
-    residuals, jacobians, cost = [], [], 0.0
+    from ...kernels.graphs.graph_tape import accumulate
+
+    residuals, jacobians, cost, dof = [], [], 0.0, space.dof
     for factor in factors:
-        residual, jacobian = _evaluated(space, factor, x)
+        (rows, arity), size = factor.nodes.shape, factor.size
+        kind, end = Kind(factor.measurement, space, factor.std is None), size * rows
+        total = np.zeros((1 + arity * dof) * end)
+        accumulate(write(kind, "jacobian").tape, x, factor.nodes, numbers_of(factor), _goal(kind, rows), total)
+        residual, jacobian = total[:end].reshape(rows, size), tuple(total[end:].reshape(arity, rows, size, dof))
         square = np.square(residual).sum(axis=1)
         if factor.loss is not None:
             root = np.sqrt(factor.loss.weight(square))[:, None]
@@ -367,17 +373,6 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
     return Linear(tuple(residuals), tuple(jacobians), cost)
 
 
-def _evaluated(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
-    """Whitened residuals and derivatives of a factor at x by the tape of its kind."""
-    from ...kernels.graphs.graph_tape import accumulate
-
-    (rows, arity), size, dof = factor.nodes.shape, factor.size, space.dof
-    kind, end = Kind(factor.measurement, space, factor.std is None), size * rows
-    total = np.zeros((1 + arity * dof) * end)
-    accumulate(write(kind, "jacobian").tape, x, factor.nodes, numbers_of(factor), _goal(kind, rows), total)
-    return total[:end].reshape(rows, size), tuple(total[end:].reshape(arity, rows, size, dof))
-
-
 @lru_cache(maxsize=64)
 def _goal(kind: Kind, rows: int) -> Any:
     """(outputs, rows) int32, where a tape's outputs go: residuals (rows, size), Jacobians (arity, rows, size, dof)."""
@@ -387,18 +382,3 @@ def _goal(kind: Kind, rows: int) -> Any:
     first = np.where(column < 0, component, size * rows * (1 + node * dof) + component * dof + direction)
     stride = np.where(column < 0, size, size * dof)
     return (first[:, None] + stride[:, None] * np.arange(rows)).astype(np.int32)
-
-
-def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int]) -> Any:
-    """Sparse Jacobian (rows, n dof), CSR; shape is n and dof."""
-    from scipy.sparse import csr_array
-
-    (n, dof), data, columns, lengths = shape, [], [], []
-    for factor, jacobians in zip(factors, linear.jacobian, strict=True):
-        by_nodes = np.concatenate(jacobians, axis=2)
-        own = (dof * factor.nodes[:, :, None] + np.arange(dof)).reshape(len(by_nodes), 1, -1)
-        data.append(by_nodes.ravel())
-        columns.append(np.broadcast_to(own, by_nodes.shape).ravel())
-        lengths.append(np.full(by_nodes[..., 0].size, own.shape[2]))
-    starts = np.append(0, np.cumsum(stacked(lengths)))
-    return csr_array((stacked(data), stacked(columns), starts), shape=(len(starts) - 1, n * dof))

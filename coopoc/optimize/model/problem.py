@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade
 from ...errors import InputError, shown, suggestion
-from .derivatives import Linear, linearise, sparse_jacobian
+from .derivatives import Linear, linearise
 from .factor import Constraint, Factor, stacked, taken, unchecked
 from .inputs import check_rotations
 from .measurements import lookup
@@ -350,8 +350,18 @@ def no_such_node(
 
 def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:
     """`Problem.linearise` at x (n, ambient), which need not be checked, and the sparse Jacobian (rows, n dof), CSR."""
+    from scipy.sparse import csr_array
+
     linear = linearise(problem.space, problem.factors, problem.movable, x)
-    return linear, sparse_jacobian(linear, problem.factors, problem.movable.shape)
+    (n, dof), data, columns, lengths = problem.movable.shape, [], [], []
+    for factor, jacobians in zip(problem.factors, linear.jacobian, strict=True):
+        by_nodes = np.concatenate(jacobians, axis=2)
+        own = (dof * factor.nodes[:, :, None] + np.arange(dof)).reshape(len(by_nodes), 1, -1)
+        data.append(by_nodes.ravel())
+        columns.append(np.broadcast_to(own, by_nodes.shape).ravel())
+        lengths.append(np.full(by_nodes[..., 0].size, own.shape[2]))
+    starts = np.append(0, np.cumsum(stacked(lengths)))
+    return linear, csr_array((stacked(data), stacked(columns), starts), shape=(len(starts) - 1, n * dof))
 
 
 def rows_among(problem: Problem, used: Bools) -> list[Ints]:
