@@ -46,7 +46,11 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     now = np.arange(len(there))
     path = np.interp(now, now[there], truth.position[there, column] @ [1, 1j, 0])
     motion = np.diff(path, prepend=path[0])
-    ratio = _ratio(recording.velocity[0, :, column] @ np.array([1, 1j, 0]) * dt, motion, MIN_COURSE_SPEED * dt)
+    measured = recording.velocity[0, :, column] @ np.array([1, 1j, 0]) * dt
+    fast = (np.abs(motion) > MIN_COURSE_SPEED * dt) & np.isfinite(measured)
+    last = np.maximum(last_true(fast), np.argmax(fast))  # where the vehicle is slow, the ratio is as before
+    times = (np.where(fast, measured, 1.0) / np.where(fast, motion, 1.0))[last]
+    ratio = np.clip(np.abs(times), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(times), -0.5, 0.5))
     error = recording.gnss[0, :, column] @ np.array([1, 1j, 0]) - path
     route, rows = slice(starts[0], starts[0] + length), np.array(starts) + np.arange(length)[:, None]
     offset = START_SPREAD * np.random.default_rng(SEED).uniform(-1, 1, (len(starts), 2)) @ [1, 1j] / np.sqrt(2)
@@ -72,15 +76,6 @@ def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
     starts = [int(fixes[np.searchsorted(fixes, np.ceil(first))]) for first in wanted]
     ends = [*starts[1:], len(recording.t)]
     return starts, min(end - start for start, end in zip(starts, ends, strict=True))
-
-
-def _ratio(measured: AnyArray, true: AnyArray, slow: float) -> AnyArray:
-    """(T,) complex factor of the odometry's motion over the true one, as before where the vehicle is slow."""
-    fast = (np.abs(true) > slow) & np.isfinite(measured)
-    last = np.maximum(last_true(fast), np.argmax(fast))
-    last_ratio = (np.where(fast, measured, 1.0) / np.where(fast, true, 1.0))[last]
-    ratio: AnyArray = np.clip(np.abs(last_ratio), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(last_ratio), -0.5, 0.5))
-    return ratio
 
 
 def _plane(values: AnyArray) -> Floats:

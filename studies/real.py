@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, Study, Track, heading_error, pose_nees
+from coopoc import V2X, PoseFilter, Sensors, Study, heading_error, pose_nees
 from coopoc.arrays import Floats, number, one_of
 from coopoc.data.log.residuals import GATE_STDS
 from coopoc.data.source import split
@@ -122,7 +122,15 @@ def cell(p: Params) -> list[Row]:
         method = filters[drive.ids.index(who[0]) % len(filters)]
         track = method(recording, who)
         online = online_columns(track, recording, method)
-        scores = _scores(track, recording, drive.truth)
+        scores, truth = dict[str, Floats](), drive.truth  # column -> (T, E), as far as the truth is known
+        if truth is not None:
+            scores["rt_le_m"] = errors(track, truth)[0]
+            if track.heading is not None and truth.heading is not None:
+                scores["heading_deg"] = np.rad2deg(heading_error(track, truth)[0])
+                scores["nees"] = pose_nees(track, truth)[0]
+        innovation = np.linalg.norm(fix_innovations(track, recording)[0], axis=-1)
+        if np.isfinite(innovation).any():
+            scores["innovation_m"] = innovation
         finite = np.isfinite(next(iter(scores.values()), np.empty((0, len(who)))))[start : start + blocks * block]
         for ego, name in enumerate(who):  # as many blocks for each vehicle, of the steps at which it can be scored
             for run, scored in enumerate(np.array_split(start + np.flatnonzero(finite[:, ego]), blocks)):
@@ -146,18 +154,6 @@ def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
 def _filter(name: str, k: int, drive: Drive) -> PoseFilter:
     options = drives.POSES[name if k else "pose-solo"]
     return PoseFilter(**options, lasting=drive.lasting, gate=GATE_STDS, begin=drive.begin, spread=drive.spread)
-
-
-def _scores(track: Track, recording: Recording, truth: Fleet | None) -> dict[str, Floats]:
-    """Column -> (T, E) against the truth, as far as it is known, and innovations of the fixes, if there are any."""
-    scores = {}
-    if truth is not None:
-        scores["rt_le_m"] = errors(track, truth)[0]
-        if track.heading is not None and truth.heading is not None:
-            scores["heading_deg"] = np.rad2deg(heading_error(track, truth)[0])
-            scores["nees"] = pose_nees(track, truth)[0]
-    innovation = np.linalg.norm(fix_innovations(track, recording)[0], axis=-1)
-    return scores | ({"innovation_m": innovation} if np.isfinite(innovation).any() else {})
 
 
 def _reduced(what: str, values: Floats) -> float:

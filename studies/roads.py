@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Method, Recording, Sensors, observe, read_log
-from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.source import split
 from coopoc.study.study import Row
@@ -57,13 +56,17 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     files = [located(data, name) for name in roads(data)[task]]
     if task in PUBLISHED:
         return published(files[0])
-    if task == "kitti":
-        recording, truth = _kitti(*map(np.loadtxt, files))
+    if task == "kitti":  # poses 3x4 of a camera (x right, z ahead) in the plane, and fixes of 2.5 m that are drawn once
+        poses = map(np.loadtxt, files)
+        ways = [np.column_stack([pose[:, 11], pose[:, 3], 0.0 * pose[:, 3]])[:, None] for pose in poses]
+        measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
+        truth = Fleet(("car",), 0.1037 * np.arange(len(motion)), ways[1], motion, name="KITTI 00")
+        drawn = observe(truth, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)
+        notes = (f"odometry: {NOTHING_SIMULATED}",)
+        recording = replace(drawn, velocity=measured[None], sensors=Sensors(), notes=notes)
     else:
-        if files:
-            log = read_log(files[0], **({"truth": files[1]} if files[1:] else {"dt": COMMA_STEP}))
-        else:
-            log = read_log(str(data))
+        options = {"truth": files[1]} if files[1:] else {"dt": COMMA_STEP} if files else {}
+        log = read_log(files[0] if files else str(data), **options)
         if log.truth is None:
             raise InputError("data", str(data), "must hold a truth", 'Name its file: "LOG?truth=FILE".')
         recording, truth = log.recording, log.truth
@@ -81,15 +84,6 @@ def published(file: Path) -> tuple[Recording, Fleet]:
     log = read_log(file)
     assert log.truth is not None
     return log.recording, log.truth
-
-
-def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
-    """Poses 3x4 of a camera (x right, z ahead) in the plane, and fixes of 2.5 m that are drawn once."""
-    ways = [np.column_stack([poses[:, 11], poses[:, 3], 0.0 * poses[:, 3]])[:, None] for poses in (odometry, truth)]
-    measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
-    fleet = Fleet(("car",), 0.1037 * np.arange(len(truth)), ways[1], motion, name="KITTI 00")
-    drawn = observe(fleet, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)
-    return replace(drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {NOTHING_SIMULATED}",)), fleet
 
 
 def road_row(task: str, data: Path | None, made: Method) -> Row:

@@ -76,16 +76,22 @@ def scored(
                 "Take egos in this order, every run, and the times of the recording.",
             )
         seconds += track.seconds
-        parts.append(_errors(track, drive, part, quantiles) if has_truth else innovation_columns(track, part))
-        parts[-1] |= online_columns(track, part, method)
         if not has_truth:
+            parts.append(innovation_columns(track, part) | online_columns(track, part, method))
             continue
+        made = {"rt_le_m": rt_le(track, drive), "max_error_m": max_error(track, drive)}
+        if quantiles:
+            error = errors(track, drive)
+            quantile = np.quantile if np.isfinite(error).all() else np.nanquantile
+            made["error_quantiles_m"] = np.moveaxis(quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1)
+        made |= online_columns(track, part, method)
         if metric:
-            parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)
+            made[metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
             each = nees(track, drive, method=method.name)
-            parts[-1]["nees"] = np.nanmean(each, axis=1)
+            made["nees"] = np.nanmean(each, axis=1)
             squares.append(each.sum(axis=0))
+        parts.append(made)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
     more: dict[str, Any] = {"seconds": seconds / recording.runs / served}
@@ -119,13 +125,3 @@ def online_columns(track: Track, recording: Recording, method: Method) -> dict[s
     account = of_track(track, recording, method.message)
     rates = {name: account.of(*counted) / account.seconds for name, counted in BYTES.items()}
     return {**rates, "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float)}
-
-
-def _errors(track: Track, drive: Fleet, recording: Recording, quantiles: int) -> dict[str, AnyArray]:
-    """Columns of errors that need no average over runs."""
-    columns = {"rt_le_m": rt_le(track, drive), "max_error_m": max_error(track, drive)}
-    if quantiles:
-        error = errors(track, drive)
-        quantile = np.quantile if np.isfinite(error).all() else np.nanquantile
-        columns["error_quantiles_m"] = np.moveaxis(quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1)
-    return columns

@@ -141,7 +141,9 @@ class Recording:
         self.__dict__["observers"] = tuple(np.asarray(self.observers).tolist())
         check_measurements(self.gnss, self.velocity, self.relative)
         self.__dict__["landmarks"] = tuple(columns("landmarks", self.landmarks, ids))
-        check_landmarks(self.landmarks, self.gnss, self.velocity)
+        at, moves = (values[:, :, list(self.landmarks)] for values in (self.gnss, self.velocity))
+        allowed, hint = "must be one position throughout, with a velocity of 0", "A vehicle is no landmark."
+        refuse("landmarks", at, ~(at == at[:1, :1]) | (moves != 0), allowed, hint)
         vehicles = np.flatnonzero(~np.isin(self.links.neighbour, self.landmarks))
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
         if self.body is not None:
@@ -348,20 +350,6 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     radians("relative angles", relative[..., 1:])
     hint, ranges = "Make it NaN: no direction is seen in one place.", relative[..., 0]
     refuse("relative", ranges, ranges <= 0, "must be a range > 0 m", hint)
-
-
-def check_landmarks(landmarks: tuple[int, ...], gnss: Floats, velocity: Floats) -> None:
-    """InputError unless landmarks stand at one position throughout.
-
-    Args:
-        landmarks: columns.
-        gnss: (R, T, N, 3) m.
-        velocity: (R, T, N, 3) m/s.
-    """
-    own = list(landmarks)
-    positions, moves = gnss[:, :, own], velocity[:, :, own]
-    allowed, hint = "must be one position throughout, with a velocity of 0", "A vehicle is no landmark."
-    refuse("landmarks", positions, ~(positions == positions[:1, :1]) | (moves != 0), allowed, hint)
 
 
 def check_links(
