@@ -45,7 +45,7 @@ OTHER_MEANINGS = {"rate", "vertical", "acc", "accel", "accuracy", "std", "sigma"
 
 
 LARGEST_TABLE = 2**27
-"""Cells of a Parquet table: 1 GB of numbers."""
+"""Numbers in a Parquet table: 1 GB."""
 
 
 def read_frame(path: Path, *text: str) -> "pd.DataFrame":
@@ -61,21 +61,7 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     import pandas as pd
 
     try:
-        if path.suffix.lower() == ".parquet":
-            from pyarrow.parquet import read_metadata
-
-            size = read_metadata(path)  # a column of one value takes no room in the file
-            if size.num_rows * size.num_columns > LARGEST_TABLE:
-                raise InputError(
-                    path.name,
-                    f"{size.num_rows} rows of {size.num_columns} columns",
-                    f"must hold at most {LARGEST_TABLE} cells",
-                    "Split the drive.",
-                )
-            frame = pd.read_parquet(path)
-            frame = frame.reset_index(drop=frame.index.name is None)
-        else:
-            frame = _read_csv(path, text)
+        frame = _read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
@@ -86,6 +72,30 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     _check_header(path, list(frame.columns))
     frame.index += 1
     return frame
+
+
+def _read_parquet(path: Path) -> "pd.DataFrame":
+    """The table without the index that pandas numbers rows with, words as objects.
+
+    A column, a list or a word that is the same throughout takes no room in the file: numbers and packed words are
+    counted in its metadata, and each word is read once, however often it stands.
+    """
+    from pyarrow.parquet import read_metadata, read_table
+
+    size = read_metadata(path)
+    chunks = [size.row_group(g).column(c) for g in range(size.num_row_groups) for c in range(size.num_columns)]
+
+    def within(count: int) -> None:
+        if count > LARGEST_TABLE:
+            allowed = f"must hold at most {8 * LARGEST_TABLE} bytes when it is unpacked"
+            raise InputError(path.name, f"{size.num_rows} rows, {8 * count} bytes", allowed, "Split the drive.")
+
+    within(max(sum(each.num_values for each in chunks), sum(each.total_uncompressed_size for each in chunks) // 8))
+    table = read_table(path, read_dictionary=[each.path_in_schema for each in chunks])
+    frame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
+    words = frame.select_dtypes("category")
+    within(len(frame) * max((len(str(word)) for name in words for word in words[name].cat.categories), default=0) // 8)
+    return frame.astype(dict.fromkeys(words, object))
 
 
 def headers(path: Path) -> list[str]:
