@@ -1,8 +1,6 @@
 """Collaborative training against collaborative decision: RT-LE against neighbours (paper, Fig. 5)."""
 
-from typing import Any
-
-from coopoc.study.numbers import Results, Where, interval, listed, mean, present, rms
+from coopoc.study.numbers import Results, interval, listed, mean, present, rms
 from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
@@ -54,12 +52,15 @@ def _sides(results: Results) -> "Plot | None":
         "RT-LE against the number of neighbours. Identity covariances are the paper's; fitted ones come from the nets' "
         "training drives. Bands: 95 % intervals."
     )
-    lines = [*solo, *shared, of(*BOUND)]
-    return curves(panels, lines, text, BOUND_NOTE, number=_interval, width=7.6, log=True)(results)
-
-
-def _interval(results: Results, where: Where) -> Any:
-    return (mean if where["method"] == "bound" else interval)(results, where)
+    return curves(
+        panels,
+        [*solo, *shared, of(*BOUND)],
+        text,
+        BOUND_NOTE,
+        number=lambda rows, where: (mean if where["method"] == "bound" else interval)(rows, where),
+        width=7.6,
+        log=True,
+    )(results)
 
 
 def findings(results: Results) -> list[str]:

@@ -23,6 +23,8 @@ collect_ignore = ["fuzz"]
 """Its programs need atheris; what they found is replayed by test_data_fuzz.py."""
 MEASURED = os.environ.get("COOPOC_TEST_DATA", "")
 """Folder of measurements of others, with what `coopoc data get` fetches; files are found by name, however deep."""
+DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
+DESCENTS = pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
 
 
 @cache

@@ -8,7 +8,8 @@ from unseen_graphs import joined, world
 from coopoc.formats.graph import Graph, PointEdges, RangeEdges
 from coopoc.optimize import Loss, Problem
 
-PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+AB = "a", "b"
+PAIR = Problem(AB).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 """Two points with fixes."""
 
 

@@ -5,20 +5,20 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import measured, refused
 from scipy import signal
 from scipy.spatial import cKDTree
+from shell import ROOT
 
 from coopoc import load_fleet
 from coopoc.data.registry import bundled, card
 from coopoc.errors import MissingLibraryError
 from coopoc.study.run import run_study
 
-SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "make_fleet.py"
+SCRIPT = ROOT / "examples" / "make_fleet.py"
 spec = importlib.util.spec_from_file_location("make_fleet", SCRIPT)
 assert spec is not None
 assert spec.loader is not None

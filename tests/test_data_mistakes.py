@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from shell import ROOT
 from strange_logs import strange
 
 import coopoc as co
@@ -16,7 +17,7 @@ from coopoc.data.log.read import read_log
 from coopoc.data.registry import kind_of
 from coopoc.data.registry import read_log as load_log
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
+PAGE = (ROOT / "docs" / "your_data.md").read_text()
 GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(
     f"{k / 10},red,x,,{0.8 * k:.1f},1.5,\n{k / 10},red,y,,0.0,1.5,\n"
     f"{k / 10},red,vx,,8.0,0.1,\n{k / 10},red,vy,,0.0,0.1,\n"

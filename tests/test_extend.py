@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused, textbook
-from random_graphs import PAIR
+from random_graphs import AB, PAIR
 from shell import ROOT, python, ran
 
 from coopoc import GNSS, V2X, JointFilter, Kalman, Sensors, observe, rt_le
@@ -116,25 +116,25 @@ def test_a_backend_is_checked_as_all_are(folder, monkeypatch):
 def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(folder, monkeypatch):
     assert output(folder, '"lidar.py:elevation"').startswith("SOLVED")
     monkeypatch.chdir(folder)
-    problem = PAIR.add("lidar.py:elevation", ("a", "b"), 0.2, std=0.01)
+    problem = PAIR.add("lidar.py:elevation", AB, 0.2, std=0.01)
     try:
         for backend in ("gauss-newton", "gtsam", "osqp", "casadi", "least_squares.py:BACKEND"):
             dx, dy, dz = np.diff(solve(problem, backend).x, axis=0)[0]
             assert np.arctan2(dz, np.hypot(dx, dy)) == pytest.approx(0.2, abs=0.01)
-        bounded = solve(problem.constrain("lidar.py:elevation", ("a", "b"), upper=0.18), "casadi")
+        bounded = solve(problem.constrain("lidar.py:elevation", AB, upper=0.18), "casadi")
         dx, dy, dz = np.diff(bounded.x, axis=0)[0]
         assert np.arctan2(dz, np.hypot(dx, dy)) == pytest.approx(0.18, abs=1e-6)
         source = folder / "lidar.py"
         edited = source.read_text().replace("m.atan2(dz,", "m.atan2(-dz,")
         source.write_text(edited)
-        dz = np.diff(solve(problem.add("lidar.py:elevation", ("a", "b"), 0.2, std=0.01)).x, axis=0)[0, 2]
+        dz = np.diff(solve(problem.add("lidar.py:elevation", AB, 0.2, std=0.01)).x, axis=0)[0, 2]
         assert dz < 0  # both rows have the formula of the edited file
         with refused(r"is no measurement.*@measurement"):
-            problem.add("least_squares.py:solver", ("a", "b"), 0.2, std=0.01)
+            problem.add("least_squares.py:solver", AB, 0.2, std=0.01)
     finally:
         MEASUREMENTS.pop("elevation", None)
     with refused("Did you mean spherical"):
-        problem.add("sperical", ("a", "b"), [9.0, 0.0, 1.5], std=0.1)
+        problem.add("sperical", AB, [9.0, 0.0, 1.5], std=0.1)
 
 
 @pytest.mark.parametrize(

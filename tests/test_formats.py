@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import measured
+from conftest import DIMENSIONS, measured
 from graph_files import write_graph
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import mmread
@@ -126,7 +126,7 @@ def test_relative_poses_and_points_are_in_the_frame_of_the_first():
     assert np.median(np.abs(distance - graph.ranges.distance)) < 0.15
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 @pytest.mark.parametrize("seed", range(5))
 def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path, dimension, seed):
     graph, rng = replace(random_graph(dimension, seed), fixed=()), np.random.default_rng(seed)
@@ -135,16 +135,11 @@ def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path, dimension, seed):
     assert_same(written(graph, tmp_path / "a.pyfg"), graph)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 @pytest.mark.parametrize("names", ["A0 L5 A1 B0 L7 B1", "A0 L0 A1 A2 L1 A4", "x0 L5 x1 x2 m7 L6"])
 def test_every_g2o_record_comes_back_to_rounding(tmp_path, dimension, names):
     graph = replace(random_graph(dimension, seed=1), names=tuple(names.split()), guess=True)
     assert_same(written(graph, tmp_path / "a.g2o"), graph, rtol=1e-12)
-
-
-def _poses(values: Any, graph: Graph, keys: dict[str, int]) -> np.ndarray:
-    at = values.atPose2 if graph.dimension == 2 else values.atPose3
-    return np.array([at(keys[name]).matrix() for name, pose in zip(graph.names, graph.is_pose, strict=True) if pose])
 
 
 def _matrices(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -156,7 +151,9 @@ def _matrices(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str, int], atol: float = 1e-12):
     """Poses, measured poses and covariances; GTSAM orders 3-D covariances rotation first."""
     order = [0, 1, 2] if graph.dimension == 2 else [3, 4, 5, 0, 1, 2]
-    assert_allclose(_poses(values, graph, keys), _matrices(graph.position, graph.rotation)[graph.is_pose], atol=atol)
+    at = values.atPose2 if graph.dimension == 2 else values.atPose3
+    poses = [at(keys[name]).matrix() for name in np.array(graph.names)[graph.is_pose]]
+    assert_allclose(poses, _matrices(graph.position, graph.rotation)[graph.is_pose], atol=atol)
     edges = graph.relative_pose
     found = [factors.at(k) for k in range(factors.size()) if "Between" in type(factors.at(k)).__name__]
     assert [f.keys() for f in found] == [[keys[graph.names[n]] for n in nodes] for nodes in edges.nodes]
@@ -167,7 +164,7 @@ def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str
     assert_allclose(cov / scale, edges.covariance[:, order][:, :, order] / scale, atol=max(atol, 1e-10))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 def test_we_read_what_gtsam_writes(tmp_path, dimension):
     gtsam = pytest.importorskip("gtsam")
     rng = np.random.default_rng(dimension)

@@ -46,16 +46,11 @@ def blockwise(matrix: Floats, d: int) -> Floats:
     return matrix.reshape(BLOCKS, d, BLOCKS, d).swapaxes(1, 2).reshape(-1)
 
 
-def drawn(d: int) -> tuple[Floats, Floats, Floats]:
-    rng = np.random.default_rng(d)
-    root = rng.normal(size=(BLOCKS * d, BLOCKS * d))
-    return root @ root.T + np.eye(BLOCKS * d), rng.normal(size=BLOCKS * d), rng.uniform(0.1, 1.0, BLOCKS * d)
-
-
 @pytest.mark.parametrize("batched", [False, True])
 def test_blocks_against_numpy(batched):
-    d = 3
-    a, eta, process = drawn(d)
+    d, size, rng = 3, 3 * BLOCKS, np.random.default_rng(3)
+    root = rng.normal(size=(size, size))
+    a, eta, process = root @ root.T + np.eye(size), rng.normal(size=size), rng.uniform(0.1, 1.0, size)
     shape = (lambda v: np.repeat(v[:, None], LANES, axis=1)) if batched else np.copy
     memory = shape(np.zeros(2 * BLOCKS * d**2))
     mine, right = shape(blockwise(a, d)), shape(eta)

@@ -7,7 +7,7 @@ import pytest
 from qcqp_relaxation import QCQPRelaxation
 
 import coopoc as co
-from coopoc import V2X, Fleet, NoiseModel, Sensors, observe
+from coopoc import V2X, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import nees
 from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
@@ -60,15 +60,10 @@ def test_a_late_message_is_no_surer_than_it_is():
     assert 0.3 < np.array(share)[:, :2].mean() < 1.1
 
 
-def brief(method: object, fleet: Fleet) -> Fleet:
-    """Semidefinite programmes take their time."""
-    return fleet.between(0, 12) if isinstance(method, QCQPRelaxation) else fleet
-
-
 @pytest.mark.parametrize("method", METHODS, ids=label)
 def test_bytes_by_closed_form(method, crossing):
     """One message per link and step: 14 numbers for an estimate with its covariance, 8 for a fix."""
-    fleet = brief(method, crossing)
+    fleet = crossing.between(0, 12) if isinstance(method, QCQPRelaxation) else crossing  # semidefinite programmes
     recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=10))
     numbers = 14 if method in FILTERS else 8
     track = method(recording, [1])

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from random_graphs import PAIR
+from random_graphs import AB, PAIR
 
 import coopoc as co
 from coopoc import optimize
@@ -142,7 +142,7 @@ def test_a_noun_keeps_no_array_that_its_owner_can_change():
     whole[3] = 99.0
     assert fleet.t[3] == 0.3
     assert not RECORDING.links.of(0).flags.writeable
-    graph = replace(PAIR, x0=np.eye(2, 3)).constrain("range", ("a", "b"), lower=1.0)
+    graph = replace(PAIR, x0=np.eye(2, 3)).constrain("range", AB, lower=1.0)
     graphs = (graph, *graph.factors, *graph.constraints)
     for noun in (FLEET, RECORDING, TRACK, of_track(TRACK, RECORDING, co.Kalman().message), *graphs):
         for copied in (copy.deepcopy(noun), pickle.loads(pickle.dumps(noun))):
@@ -272,7 +272,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (
         least_squares,
-        {"nodes": ("a", "b"), "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])},
+        {"nodes": AB, "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])},
     ),
     "solve": (lambda **given: co.solve(**given).x, {"problem": PAIR, "backend": "gauss-newton"}),
     "incremental": (lambda **given: co.incremental(**given)[0], {"problem": PAIR, "lag": 2, "params": None}),
@@ -375,7 +375,7 @@ def test_a_wrong_argument_gives_an_error_of_ours_a_right_number_or_a_note(name):
 
 
 def test_solvers_refuse_arguments_of_the_wrong_kind():
-    whole = PAIR.add("range", ("a", "b"), 10.0, std=1.0)
+    whole = PAIR.add("range", AB, 10.0, std=1.0)
     solution = co.solve(whole)
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
     with refused("nodes = 10000 nodes: must name each of 2 nodes once"):
@@ -384,8 +384,8 @@ def test_solvers_refuse_arguments_of_the_wrong_kind():
     swept(optimize.loop_closures, {"problem": whole})
     swept(solution.__getitem__, {"point": "a"})
     swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
-    swept(PAIR.add, {"kind": "range", "nodes": ("a", "b"), "z": 9.0, "std": 1.0, "loss": None})
-    swept(PAIR.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0})
+    swept(PAIR.add, {"kind": "range", "nodes": AB, "z": 9.0, "std": 1.0, "loss": None})
+    swept(PAIR.constrain, {"kind": "range", "nodes": AB, "lower": 1.0, "upper": 9.0})
     window = {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None}
     swept(co.Problem.from_window, window)
     named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,6 +49,11 @@ def drawn(seed: int) -> tuple[co.Fleet, co.Sensors]:
     )
 
 
+def off(x: Any, fleet: co.Fleet) -> Any:
+    """Of the first vehicle, m."""
+    return x[:, :, 0] - fleet.position[:, 0]
+
+
 def observed(fleet: co.Fleet, sensors: co.Sensors, runs: int = 2, seed: int = 0) -> co.Recording:
     return co.observe(fleet, sensors, co.V2X(max_neighbours=10), runs=runs, seed=seed)
 
@@ -75,10 +81,10 @@ def situations() -> Iterator[tuple[str, co.Fleet, co.Sensors]]:
 def test_estimates_stay_sane_where_digits_are_few(fleet, sensors):
     """No method leaves its own fixes by more than their noise may; every covariance is symmetric, none is negative."""
     recording = observed(fleet, sensors)
-    fixes = np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
+    fixes = np.abs(off(recording.gnss, fleet)).max()
     for name in COOPERATIVE:
         track = METHODS[name]("nominal")(recording, [0])
-        away = np.abs(track.x[:, :, 0] - fleet.position[:, 0]).max()
+        away = np.abs(off(track.x, fleet)).max()
         assert away < 5.0 * fixes + 5.0 * min(sensors.range_std, 1.0), name
         if track.covariance is not None:
             size = np.abs(track.covariance).max(axis=(-1, -2), keepdims=True)
@@ -130,8 +136,8 @@ def test_the_smoother_descends_where_whole_steps_lead_away():
     )
     recording = observed(fleet, sensors, 6, 13)
     settled = co.BatchSmoother()(recording, [0]).x
-    error = np.linalg.norm(settled[:, :, 0] - fleet.position[:, 0], axis=-1)
-    assert error.max() < 3.0 * np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
+    error = np.linalg.norm(off(settled, fleet), axis=-1)
+    assert error.max() < 3.0 * np.abs(off(recording.gnss, fleet)).max()
 
 
 def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Recording]]) -> dict[str, float]:
@@ -140,7 +146,7 @@ def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Record
     for fleet, recording in drives:
         for name in names.split():
             track = METHODS[name]("nominal")(recording, [0])
-            squares.setdefault(name, []).append(((track.x[:, :, 0] - fleet.position[:, 0]) ** 2).sum(axis=-1))
+            squares.setdefault(name, []).append((off(track.x, fleet) ** 2).sum(axis=-1))
             assert name == "kalman" or any(words in note for note in track.notes), name
     return {name: float(np.sqrt(np.mean(found))) for name, found in squares.items()}
 

@@ -9,13 +9,13 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
 from random_graphs import random_graph, star
+from shell import ROOT
 
 from coopoc import V2X, Sensors, load_fleet, observe
 from coopoc.optimize import (
@@ -71,7 +71,7 @@ CASES: dict[str, Callable[[], Problem]] = {
     "linear": linear,
     "active bound": bounded,
 }
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "extend.md").read_text()
+PAGE = (ROOT / "docs" / "extend.md").read_text()
 OWN: dict[str, Any] = {}
 exec(next(text for text in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "# least_squares.py" in text), OWN)
 PLUG_IN: Backend = OWN["BACKEND"]

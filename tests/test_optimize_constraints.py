@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
-from random_graphs import PAIR
+from random_graphs import AB, PAIR
 from scipy.linalg import null_space
 from scipy.optimize import LinearConstraint, NonlinearConstraint, lsq_linear, minimize
 
@@ -31,7 +31,7 @@ from coopoc.optimize.assess.active import active_at
 INF = np.inf
 BOTH = ["osqp", "casadi"]
 """Of linear constraints; others hold in the second alone."""
-RANGED = PAIR.add("range", ("a", "b"), 8.0, std=0.5)
+RANGED = PAIR.add("range", AB, 8.0, std=0.5)
 
 
 def road(x, y, m=np):
@@ -264,13 +264,13 @@ def east(problem: Problem, node: str, lower: float = -INF, upper: float = INF) -
     return problem.constrain("position", node, [lower, -INF, -INF], [upper, INF, INF])
 
 
-SHIFTED = RANGED.constrain("displacement", ("a", "b"), [5, 0, 0], [5, 0, 0])
+SHIFTED = RANGED.constrain("displacement", AB, [5, 0, 0], [5, 0, 0])
 EMPTY = {
     "what an equality allows": east(east(SHIFTED, "a", upper=0), "b", 10),
     "two boxes": east(east(RANGED, "a", 3), "a", upper=2),
     "by a tenth of a millimetre": east(east(PAIR, "a", 3), "a", upper=2.9999),
-    "two ranges": RANGED.constrain("range", ("a", "b"), 5, 5).constrain("range", ("a", "b"), 7, 7),
-    "a range and two boxes": east(east(RANGED.constrain("range", ("a", "b"), upper=5.0), "a", upper=-5), "b", 15),
+    "two ranges": RANGED.constrain("range", AB, 5, 5).constrain("range", AB, 7, 7),
+    "a range and two boxes": east(east(RANGED.constrain("range", AB, upper=5.0), "a", upper=-5), "b", 15),
     "what is held": replace(RANGED, x0=[[0, 0, 0], [9, 0, 0]], fixed=(0,)).constrain(
         "position", "a", [1, 0, 0], [1, 0, 0]
     ),
@@ -282,7 +282,7 @@ def test_what_equalities_place_is_known_exactly(backend):
     """Also where one more says the same, but for casadi, which takes no more equalities than numbers that can move."""
     places = np.array([[1.0, 0, 0], [6, 0, 0]])
     placed = PAIR.constrain("position", ["a", "b"], places, places)
-    more = placed.constrain("displacement", ("a", "b"), [5, 0, 0], [5, 0, 0])
+    more = placed.constrain("displacement", AB, [5, 0, 0], [5, 0, 0])
     for problem in (placed, more):
         if backend == "casadi" and problem is more:
             with refused(r"9 equalities.*6 numbers that can move"):
@@ -315,13 +315,13 @@ def test_a_backend_without_constraints_names_those_that_hold_them(backend):
         with refused(rf"on position: cannot be solved by {backend}, only by .*casadi.*osqp"):
             solve(PAIR.constrain("position", "a", upper=1.0), backend)
     with refused(rf"constraint on range: cannot be solved by {backend}, only by \['casadi'\]"):
-        solve(PAIR.constrain("range", ("a", "b"), upper=1.0), backend)
+        solve(PAIR.constrain("range", AB, upper=1.0), backend)
 
 
 def test_the_far_side_of_a_range_is_a_maximum():
     """b must be 8 m from a, and is seen at 9 m to the right: the point 8 m to the left is stationary too."""
-    problem = Problem(("a", "b"), x0=[[0, 0, 0], [-8, 0, 0]]).add("position", "a", [0, 0, 0], std=0.1)
-    problem = problem.add("position", "b", [9, 0, 0], std=3.0).constrain("range", ("a", "b"), 8.0, 8.0)
+    problem = Problem(AB, x0=[[0, 0, 0], [-8, 0, 0]]).add("position", "a", [0, 0, 0], std=0.1)
+    problem = problem.add("position", "b", [9, 0, 0], std=3.0).constrain("range", AB, 8.0, 8.0)
     stuck = solve(problem, "casadi", throw=False)
     assert stuck.x[1, 0] == pytest.approx(-8.0, abs=0.1)
     assert stuck.gradient_norm < 1e-6

@@ -34,17 +34,12 @@ def test_the_sign_of_the_curvature_is_that_of_casadis_hessian():
     assert 5 < sum(signs) < 35
 
 
-def between_two() -> Problem:
-    """An ego whose fix lies on the line of 10 m between two others, which are both 10 m away: it stands beside it."""
-    fixes = [[0, 0, 0], [-5, 0, 0], [5, 0, 0]]
-    stds = np.outer([10, 0.1, 0.1], np.ones(3))
-    problem = Problem(("ego", "a", "b")).add("position", ["ego", "a", "b"], fixes, std=stds)
-    return problem.add("range", [("ego", "a"), ("ego", "b")], [10.0, 10.0], std=0.5)
-
-
 @pytest.mark.parametrize("backend", sorted(set(backends()) - {"cvxpy"}))
 def test_a_saddle_is_not_solved(backend):
-    problem = between_two()
+    """An ego whose fix lies on the line of 10 m between two others, which are both 10 m away: it stands beside it."""
+    fixes, stds = [[0, 0, 0], [-5, 0, 0], [5, 0, 0]], np.outer([10, 0.1, 0.1], np.ones(3))
+    problem = Problem("cab").add("position", range(3), fixes, std=stds)
+    problem = problem.add("range", [(0, 1), (0, 2)], [10.0, 10.0], std=0.5)
     freely = solve(problem, backend)  # without an x0 its start is left, to one side or the other
     assert freely.notes[0] == race.ELSEWHERE
     problem = replace(problem, x0=problem.factors[0].z)

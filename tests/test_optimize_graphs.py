@@ -8,7 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from conftest import measured, refused
+from conftest import DIMENSIONS, measured, refused
 from hard_graphs import cropped
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import moved, random_drive, random_graph
@@ -17,7 +17,7 @@ from scipy.sparse import csc_array
 from unseen_graphs import drone, range_aided, world
 
 import coopoc as co
-from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
+from coopoc.formats.graph import PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
 from coopoc.optimize.assess.assess import DENSE_COLUMNS, _seen, as_stated, assess, expected, newton_decrease
@@ -61,23 +61,19 @@ def test_what_is_solved_is_scipys_minimum(seed):
     assert np.abs(theirs.x).max() < 1e-5
 
 
-def without_noise(seed: int, dimension: int) -> Graph:
-    graph = random_graph(seed, dimension, loops=30, seen=60, ranges=0, turn_std=1e-6, step_std=1e-6)
+@DIMENSIONS
+def test_averages_find_the_truth_whatever_the_odometry_was(dimension):
+    graph = random_graph(201, dimension, loops=30, seen=60, ranges=0, turn_std=1e-6, step_std=1e-6)
     exact = from_graph(graph, start="file")
     assert exact.cost(exact.x0) < 1e4  # landmarks are seen with 0.2 m
-    return graph
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_averages_find_the_truth_whatever_the_odometry_was(dimension):
-    graph = replace(without_noise(201, dimension), relative_point=PointEdges())
+    graph = replace(graph, relative_point=PointEdges())
     truth = Space(dimension, has_rotation=True).join(graph.position, graph.rotation)
     poses = np.flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
     found = from_graph(graph, start="tree").x0
     assert found[poses] == pytest.approx(truth[poses], abs=1e-3)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 @pytest.mark.parametrize("seed", [203, 204, 205])
 def test_the_automatic_start_undoes_bad_odometry(dimension, seed):
     """Odometry of 6 degrees a step, which loops and landmarks correct: to the minimum that the truth leads to."""
@@ -98,7 +94,7 @@ def test_real_graphs_reach_the_best_that_is_known(name, best):
 
 
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
 def test_tapes_are_the_formulas(dimension, objective, loss):
     """Cost, gradient, J^T J and the exact Hessian of the tapes against r and J of a problem and differences of them."""
@@ -154,7 +150,7 @@ def assert_gtsams_marginals(covariance: np.ndarray, problem: Problem, x: np.ndar
     assert covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 def test_marginals_are_those_of_gtsams_bayes_tree(dimension):
     problem = from_graph(random_graph(211, dimension, steps=60))
     found = solve(problem)
@@ -346,7 +342,7 @@ def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps, un
     assert found.iterations <= alone.iterations + 2
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension):
     """Closed form: half a chi-square, whose angles count twice in the plane; mean and spread over 40 graphs."""
     found, known = [], (0.0, 0.0)

@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from conftest import DIMENSIONS
 from test_optimize_poses import everything
 
 from coopoc.optimize import Loss, Problem, pose, solve
@@ -117,7 +118,7 @@ def test_what_gtsam_lacks_is_a_custom_factor(dimension, kind, nodes, noise, loss
     assert_same_objective(problem)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 def test_marginals_equal_gtsams(dimension):
     """gtsam.Marginals, which moves a pose along its body's axes, with the rotation first in space; without residuals,
     on which J^T J of GTSAM's chords depends."""

@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import DIMENSIONS, refused
 from random_graphs import random_graph
 
 from coopoc.optimize import Problem, solve
@@ -13,7 +13,7 @@ from coopoc.optimize.graph_problems import from_graph
 
 
 @pytest.mark.parametrize("steps", [10, 60])
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 def test_a_joint_covariance_is_a_part_of_the_inverse(dimension, steps):
     """Few nodes by a dense factor, many by a sparse one; a fixed node has none."""
     problem = from_graph(random_graph(1, dimension, steps=steps))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import refused
+from conftest import DIMENSIONS, refused
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +20,7 @@ ROTATIONS = Rotation.random(50, random_state=1).as_matrix()
 COUNT = 12
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@DIMENSIONS
 @pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
 def test_derivatives_equal_torchs(kind, dimension):
     """By the steps (dp, w) of the nodes, R Exp(w), far from the measured values, near them and at them."""

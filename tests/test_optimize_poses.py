@@ -5,7 +5,7 @@ from time import perf_counter
 
 import numpy as np
 import pytest
-from conftest import measured, refused
+from conftest import DESCENTS, measured, refused
 from random_graphs import moved
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -59,7 +59,7 @@ def relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
     return space.join(R[i].T @ (p[j] - p[i]), R[i].T @ R[j])
 
 
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@DESCENTS
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     problem, truth = everything(dimension)
@@ -228,7 +228,7 @@ def test_what_no_start_knows_is_drawn():
     assert found.build_seconds < found.extras["start_seconds"]
 
 
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@DESCENTS
 def test_points_that_a_pose_sees_in_the_world_do_not_start_in_one_place(backend):
     seen = Problem("pab", dimension=2, poses=(0,)).add("pose", 0, pose([0, 0], 0), std=0.1)
     seen = seen.add("spherical", [(0, 1), (1, 2), (0, 2)], [[5.0, 0.3], [4.0, 1.2], [8.11, 0.697]], std=[0.1, 0.02])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import refused
 from oracles.whitened import whitened
-from random_graphs import PAIR
+from random_graphs import AB, PAIR
 
 from coopoc import V2X, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import Factor, Loss, Problem, SolveError, Status, pose, solve
@@ -29,7 +29,7 @@ def mixed() -> Problem:
     rng = np.random.default_rng(0)
     p = Problem("abcd", x0=rng.normal(size=(4, 3)) * 10)
     p = p.add("position", list("abcd"), rng.normal(size=(4, 3)) * 10, std=rng.uniform(1, 3, (4, 3)))
-    p = p.add("displacement", ("a", "b"), [5, 1, 0], sqrt_information=np.tril(rng.uniform(0.5, 1, (3, 3))))
+    p = p.add("displacement", AB, [5, 1, 0], sqrt_information=np.tril(rng.uniform(0.5, 1, (3, 3))))
     p = p.add("spherical", [("a", "c"), ("d", "b")], [[9, 1, 1.5], [12, -3, 1.2]], std=[1, 0.07, 0.07])
     p = p.add("range", ("c", "d"), 7.0, std=0.5).add("azimuth", ("b", "d"), 2.0, std=0.1)
     return p.add("inclination", ("a", "d"), 1.4, std=0.1)
@@ -85,54 +85,54 @@ def test_a_range_below_the_gate_widens_its_angles(recording):
 
 
 def test_infinite_std_is_no_measurement():
-    with_blank = PAIR.add("spherical", ("a", "b"), [9.5, 0.1, 1.5], std=np.inf).add("range", ("a", "b"), 10, std=1.0)
-    without = PAIR.add("range", ("a", "b"), 10, std=1.0)
+    with_blank = PAIR.add("spherical", AB, [9.5, 0.1, 1.5], std=np.inf).add("range", AB, 10, std=1.0)
+    without = PAIR.add("range", AB, 10, std=1.0)
     for backend in ("gauss-newton", "gtsam", "osqp"):
         assert solve(with_blank, backend).x == pytest.approx(solve(without).x, abs=1e-9)
 
 
 BAD = {
     "nan": (lambda: PAIR.add("position", "a", [0, np.nan, 0], std=1.0), "finite"),
-    "zero std": (lambda: PAIR.add("range", ("a", "b"), 5.0, std=0.0), "must be > 0"),
-    "degrees": (lambda: PAIR.add("azimuth", ("a", "b"), 270.0, std=0.1), "deg2rad"),
-    "zero range": (lambda: PAIR.add("range", ("a", "b"), 0.0, std=1.0), "Coincident"),
+    "zero std": (lambda: PAIR.add("range", AB, 5.0, std=0.0), "must be > 0"),
+    "degrees": (lambda: PAIR.add("azimuth", AB, 270.0, std=0.1), "deg2rad"),
+    "zero range": (lambda: PAIR.add("range", AB, 0.0, std=1.0), "Coincident"),
     "unknown node": (lambda: PAIR.add("range", ("a", "c"), 5.0, std=1.0), "one of a, b"),
     "misspelt node": (lambda: Problem(("car", "bus")).add("range", ("car", "buss"), 5.0, std=1.0), "Did you mean bus"),
     "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "different points"),
-    "unknown kind": (lambda: PAIR.add("doppler", ("a", "b"), 5.0, std=1.0), "spherical"),
-    "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "exactly one of std, cov"),
-    "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0], std=1.0), "must have 2 or 3"),
-    "shape of std": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
+    "unknown kind": (lambda: PAIR.add("doppler", AB, 5.0, std=1.0), "spherical"),
+    "no std": (lambda: PAIR.add("range", AB, 5.0), "exactly one of std, cov"),
+    "shape of z": (lambda: PAIR.add("spherical", AB, [5.0], std=1.0), "must have 2 or 3"),
+    "shape of std": (lambda: PAIR.add("spherical", AB, [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
     "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.ones((2, 3))), "square matrices"),
-    "std of a turn": (lambda: PAIR.add("azimuth", ("a", "b"), 0.1, std=4.0), "<= pi rad"),
-    "shape of a root": (lambda: PAIR.add("azimuth", ("a", "b"), 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
-    "root not finite": (lambda: PAIR.add("azimuth", ("a", "b"), 0.1, sqrt_information=[[np.inf]]), "must be finite"),
+    "std of a turn": (lambda: PAIR.add("azimuth", AB, 0.1, std=4.0), "<= pi rad"),
+    "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
+    "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[np.inf]]), "must be finite"),
     "heights in a plane": (
-        lambda: Problem("ab", dimension=2).constrain("inclination", ("a", "b"), 0.0, 1.0),
+        lambda: Problem("ab", dimension=2).constrain("inclination", AB, 0.0, 1.0),
         "does not exist in two dimensions",
     ),
     "no factor": (lambda: Problem("a", factors=(1,)), "must be Factors"),
     "nodes of a factor": (lambda: Factor("range", [[0]], [[5.0]], std=[[1.0]]), r"must have shape \(M, 2\) for range"),
     "a factor of another problem": (lambda: Problem("a", factors=PAIR.factors), "one of a"),
     "no bound": (lambda: PAIR.constrain("position", "a"), "must bound something"),
-    "bounds of a pose": (lambda: PAIR.constrain("relative_pose", ("a", "b")), "cannot bound them"),
+    "bounds of a pose": (lambda: PAIR.constrain("relative_pose", AB), "cannot bound them"),
     "a loss relaxed": (
-        lambda: quadratic(PAIR.add("range", ("a", "b"), 9.0, std=1.0, loss=Loss("huber", 2.0))),
+        lambda: quadratic(PAIR.add("range", AB, 9.0, std=1.0, loss=Loss("huber", 2.0))),
         "is not quadratic",
     ),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
     "twice a name": (lambda: Problem(("b", "a", "a")), r"\['a'\]: must be unique"),
-    "x0": (lambda: Problem(("a", "b"), x0=np.zeros((3, 3))), "shape"),
+    "x0": (lambda: Problem(AB, x0=np.zeros((3, 3))), "shape"),
     "no factors": (lambda: solve(Problem(("a",))), "no measurements"),
-    "words for z": (lambda: PAIR.add("range", ("a", "b"), "far", std=1.0), "array of numbers"),
+    "words for z": (lambda: PAIR.add("range", AB, "far", std=1.0), "array of numbers"),
     "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
-    "shown": (lambda: Problem(("a", "b"), shown="c"), "node = .c.: must be one of a, b"),
+    "shown": (lambda: Problem(AB, shown="c"), "node = .c.: must be one of a, b"),
     "x0 not finite": (lambda: Problem(("a",), x0=[[np.nan, 0, 0]]), "x0 = not finite"),
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
     "coincident, bounded": (
-        lambda: solve(replace(PAIR, x0=np.zeros((2, 3))).constrain("range", ("a", "b"), 4.0, 5.0)),
+        lambda: solve(replace(PAIR, x0=np.zeros((2, 3))).constrain("range", AB, 4.0, 5.0)),
         "a and b coincide",
     ),
     "nothing to relax": (lambda: quadratic(Problem("a")), "no measurements"),

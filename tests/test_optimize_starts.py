@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import DESCENTS
 from random_graphs import random_drive
 from scipy.optimize import least_squares
 from unseen_graphs import lost, ranged_drives, world
@@ -234,7 +235,7 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
         assert (next(wound, None) is None) is expected
 
 
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@DESCENTS
 @pytest.mark.parametrize(("d", "seed"), [(2, 315), (3, 303)])
 def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, backend):
     """Costs that noise may explain lead from there, 49 for 25 and 34 for 21: without a note before."""

@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from conftest import DESCENTS
 from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
@@ -20,7 +21,7 @@ def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float | Floats) 
     return problem.add("range", [(k, "r") for k in range(count)], ranges, std=std)
 
 
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@DESCENTS
 @pytest.mark.parametrize(("z", "std"), [(1e308, 1.0), (1.0, 1e-160)])
 def test_an_infinite_cost_is_no_minimum(z, std, backend):
     problem = ranged(np.zeros((1, 2)), np.ones(2), np.array([z]), std).add("position", "r", [1, 1], 1.0)
@@ -51,7 +52,7 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
         assert found.covariance[3] == pytest.approx(np.linalg.inv(np.array(hessian) / 4e-6), rel=1e-3)
 
 
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@DESCENTS
 @pytest.mark.parametrize("offset", [0.0, 5e6])
 @pytest.mark.parametrize("degrees", [0, 20, 45])
 def test_a_strict_minimum_is_one_wherever_the_axes_are(degrees, offset, backend):

@@ -117,12 +117,6 @@ def test_it_is_as_good_as_with_ten_passes(crossing, monkeypatch):
     assert errors[0] < 1.02 * errors[1]
 
 
-def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:
-    """What a vehicle measured of itself at a step."""
-    rate, heading = (values[run, t, column] for values in (recording.body.yaw_rate, recording.body.heading))
-    return co.OwnMeasurement(recording.velocity[run, t, column], rate, recording.gnss[run, t, column], heading)
-
-
 @pytest.mark.parametrize("how", [{}, {"lasting": True, "exact": False, "gate": 3.0}])
 def test_a_stream_gives_the_numbers_of_its_track(rough, how):
     method, links = co.PoseFilter("solo", assumed=replace(NOISE, range_offset_std=0.5), **how), rough.links
@@ -134,7 +128,8 @@ def test_a_stream_gives_the_numbers_of_its_track(rough, how):
             marks = [
                 co.LandmarkMeasurement(rough.relative[run, k], rough.gnss[run, t, links.neighbour[k]]) for k in now
             ]
-            x, cov = stream.step(own_of(rough, run, t, 0), marks)
+            own = (each[run, t, 0] for each in (rough.velocity, rough.body.yaw_rate, rough.gnss, rough.body.heading))
+            x, cov = stream.step(co.OwnMeasurement(*own), marks)
             assert_array_equal(x[:3], track.x[run, t, 0])
             assert_array_equal(x[3], track.heading[run, t, 0])  # type: ignore[index]
             assert_array_equal(cov[:3, :3], track.covariance[run, t, 0])  # type: ignore[index]

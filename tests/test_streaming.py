@@ -4,7 +4,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from conftest import holed, measured, refused, textbook
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles.solo import filterpys
-from shell import ran
+from shell import ROOT, ran
 
 from coopoc import V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Floats
@@ -22,7 +21,6 @@ from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement
 from coopoc.world.recording import Recording
 
-ROOT = Path(__file__).resolve().parents[1]
 S2 = Sensors.paper_scenario2()
 FITTED = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
 OKF = OptimisedKF((0.05, 0.04, 0.01), (0.1, 0.12, 0.05), (1.5, 1.6, 1.7))

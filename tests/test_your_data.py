@@ -1,6 +1,7 @@
 """docs/your_data.md as it stands: its script, its commands and its Python run one by one in an empty folder."""
 
 import re
+import shlex
 
 import numpy as np
 import pandas as pd
@@ -15,11 +16,6 @@ PAGE = (ROOT / "docs" / "your_data.md").read_text()
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
-
-
-def words(line: str) -> list[str]:
-    """Words of a command, with its quotes taken off."""
-    return [a or b for a, b in re.findall(r'"([^"]*)"|(\S+)', line)]
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +40,7 @@ def test_every_command_runs(folder):
     commands = [line for block in blocks("sh") for line in block.splitlines()]
     assert len(commands) == 10
     for command in commands[1:]:
-        out = python("-W", "error", "-m", "coopoc.cli", *words(command)[1:], cwd=folder)
+        out = python("-W", "error", "-m", "coopoc.cli", *shlex.split(command)[1:], cwd=folder)
         if "data check" in command:
             assert "nothing looks wrong" in out
             assert "stands at (180.0, -20.0, 0.0) m" in out
