@@ -19,8 +19,7 @@ from coopoc.optimize.model.factor import taken
 from coopoc.optimize.model.space import Space, exp
 from coopoc.optimize.starts import graph_starts, race
 from coopoc.optimize.starts.graph_starts import tree, walk
-from coopoc.optimize.starts.mirrors import ranges_of
-from coopoc.optimize.starts.windings import rewound
+from coopoc.optimize.starts.mirrors import ranges_of, rewound
 
 
 def scipys(problem: Problem, start: Floats) -> float:

@@ -13,9 +13,8 @@ from coopoc.arrays import Floats, check_fields, seed_of
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
-from coopoc.methods.kalman import solo_filter, solo_track
+from coopoc.methods.kalman import FilterStream, solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval, check_std
-from coopoc.methods.stream import FilterStream
 from coopoc.methods.track import Alone, in_stretches
 from coopoc.text import short_repr
 from coopoc.world.recording import Vehicles, check_recording

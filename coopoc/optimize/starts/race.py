@@ -13,9 +13,8 @@ from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
 from .initial import directed
-from .mirrors import RANGES, Cost, Descend, across
+from .mirrors import RANGES, Cost, Descend, across, rewound
 from .pose_starts import joining
-from .windings import rewound
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
