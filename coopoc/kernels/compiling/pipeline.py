@@ -20,7 +20,7 @@ class KernelLibrary(JITCodeLibrary):
         """Link what is called, and what that calls, once into what Python calls, and nothing into a part."""
         called = self._linking_libraries
         self._linking_libraries = [] if self.is_part else [*_all_called(called)]
-        super().finalize()
+        super().finalize()  # type: ignore[no-untyped-call]
         self._linking_libraries = called
 
     def _optimize_functions(self, ll_module: Any) -> None:
@@ -86,11 +86,11 @@ class Kernel(CompilerBase):
     def _compile_core(self) -> Any:
         self.state.flags, self.state.flags.no_compile = KernelFlags(self.state.flags), self.is_part  # type: ignore[no-untyped-call]
         resolve = BaseFunction.get_call_type
-        BaseFunction.get_call_type = _known_call
+        BaseFunction.get_call_type = _known_call  # type: ignore[method-assign]
         try:
             made = super()._compile_core()  # type: ignore[no-untyped-call]
         finally:
-            BaseFunction.get_call_type = resolve
+            BaseFunction.get_call_type = resolve  # type: ignore[method-assign]
         if self.is_part:
             desc, libraries = made.fndesc, (made.library,)
             key = make_function(desc.lookup_module(), desc.qualname, "", 0, made.environment, libraries)
