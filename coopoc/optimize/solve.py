@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES, sparse
 from .assess.active import constraint_rows
-from .assess.assess import Assessment, assess, held, is_constrained_minimum, judged, newton_decrease
+from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, SolverResult, require_backend
 from .descent.levenberg_marquardt import arrive
 from .graph_problems import started
@@ -140,8 +140,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     search = problem.search
     solved = clock()
     x, iterations = result.x, result.iterations
-    quick = not (covariance or constraints or problem.linear)
-    truth = (held(problem, x) if quick else None) or assess(problem, x, covariance)
+    truth = assess(problem, x, covariance, quick=not covariance)
     status = Status.INFEASIBLE if result.infeasible else _status(problem, x, truth)
     extras = dict(result.extras)
     if search.start:

@@ -74,8 +74,9 @@ class Assessment:
         return 0.0 if self.active is None else float(self.active.rows.outside.max())
 
 
-def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
-    """Assessment of a problem at x (n, ambient); without constraints the covariance may be left out.
+def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = False) -> Assessment:
+    """Assessment of a problem at x (n, ambient); without constraints the covariance may be left out, and be `quick`
+    where the exact Hessian alone tells that x is held.
 
     >>> from coopoc.optimize import Problem
     >>> vague = Problem(("a",)).add("position", ["a"], [[0, 0, 0]], std=1e8)  # known to 1e8 m is not unknown
@@ -83,7 +84,7 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     array([1.e+16, 1.e+16, 1.e+16])
     """
     if not problem.constraints:
-        return _unconstrained(problem, sparse(problem), x, covariance)
+        return _unconstrained(problem, sparse(problem), x, covariance, quick and not problem.linear)
     (linear, J), shape = linearised(problem, x), problem.movable.shape
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
     active = active_at(problem, x, gradient.reshape(shape))
@@ -103,34 +104,16 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     return Assessment(linear.cost, size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
 
 
-def held(problem: Problem, x: Floats) -> Assessment | None:
-    """The assessment without a covariance of a problem without constraints at x (n, ambient), by one factorisation;
-    None where the exact Hessian alone does not tell that x is held."""
-    system = sparse(problem)
-    cost, gradient, values = system.quadratic(x, "newton")
-    if not np.isfinite(values).all() or not system.cholesky.factor(values):
-        return None
-    if not (
-        _largest(problem, system.entries, values[system.entries.diagonal]) < INFLATION * system.cholesky.pivots
-    ).all():
-        return None
-    step = system.cholesky.solve(gradient)
-    none, far = np.full((len(x), *(problem.space.dof,) * 2), np.nan), float(np.abs(step).max(initial=0.0))
-    return Assessment(
-        cost, float(np.linalg.norm(gradient)), none, far, predicted=0.5 * float(gradient @ step), newton=True
-    )
-
-
-def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool) -> Assessment:
+def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool, quick: bool = False) -> Assessment:
     """The assessment of a problem without constraints.
 
     A pivot is the information of an unknown with those before it eliminated and those after it given, so that its
     inverse is no larger than the variance: along a free direction one is rounding.
     """
     cholesky, entries = system.cholesky, system.entries
-    cost, gradient, values = system.quadratic(x, "gauss-newton")
+    cost, gradient, values = system.quadratic(x, "newton" if quick else "gauss-newton")
     none = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
-    if not (np.isfinite(values).all() and np.isfinite(cost)):
+    if not (quick or (np.isfinite(values).all() and np.isfinite(cost))):
         return Assessment(cost, np.inf, none, np.nan)
     size = float(np.linalg.norm(gradient))
     unknown = Assessment(cost, size, none, np.nan)
@@ -143,10 +126,12 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
     step = variance = np.full(entries.size, np.inf)
     if held := cholesky.factor(values):
         step, variance = cholesky.solve(gradient), 1.0 / cholesky.pivots
-        if covariance or not (variance * own < INFLATION).all():
+        if not quick and (covariance or not (variance * own < INFLATION).all()):
             cov, variance = _inverse(problem, x, "gauss-newton")
         if (variance * own < INFLATION).all():
-            return ended(cov, step)
+            return replace(ended(cov, step), newton=quick)
+    if quick:
+        return _unconstrained(problem, system, x, covariance)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
         scale, steepness = own + (own == 0), _largest(problem, entries, np.abs(gradient))
