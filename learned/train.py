@@ -25,9 +25,8 @@ from .nets.okf import NoiseParameters
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
-from .training.fit import Judge, fit
+from .training.fit import Judge, fit, fit_okf
 from .training.machine import LINE
-from .training.okf_fit import fit_okf
 
 LEAST_STD = 1e-6
 """m, of noise that is fitted, and share of a velocity."""

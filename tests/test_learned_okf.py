@@ -17,8 +17,7 @@ from coopoc.learned import NoiseParameters, OptimisedKF, clients
 from coopoc.learned.nets.gain import flatten
 from coopoc.learned.nets.okf import scan
 from coopoc.learned.training.clients import Batch
-from coopoc.learned.training.fit import Judge
-from coopoc.learned.training.okf_fit import fit_okf
+from coopoc.learned.training.fit import Judge, fit_okf
 
 
 @pytest.mark.parametrize("start", ["gnss", "true"])
