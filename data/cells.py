@@ -92,7 +92,7 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
 
     within(max(sum(each.num_values for each in chunks), sum(each.total_uncompressed_size for each in chunks) // 8))
     table = read_table(path, read_dictionary=[each.path_in_schema for each in chunks])
-    frame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
+    frame: pd.DataFrame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
     words = frame.select_dtypes("category")
     within(len(frame) * max((len(str(word)) for name in words for word in words[name].cat.categories), default=0) // 8)
     return frame.astype(dict.fromkeys(words, object))
