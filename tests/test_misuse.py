@@ -19,7 +19,7 @@ from coopoc.errors import shown
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import fix_innovations
 from coopoc.formats import load_graph, read_g2o, read_pyfg
-from coopoc.methods import gaps
+from coopoc.methods.track import follow as followed
 from coopoc.study.publish import views
 from coopoc.study.reference import Reference
 from coopoc.study.report import report
@@ -108,7 +108,7 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         (lambda: replace(TRACK, x=np.nan * TRACK.x), "not finite in run 0 at step 0"),
         (lambda: co.Kalman()(replace(RECORDING, gnss=np.nan * RECORDING.gnss), [0]), "has no fix at step 0"),
         (lambda: load_graph("."), r"path = \.: must end in"),
-        (lambda: gaps.follow("kalman", RECORDING, [0]), "method = 'kalman': must be a Method"),
+        (lambda: followed("kalman", RECORDING, [0]), "method = 'kalman': must be a Method"),
         (lambda: replace(TRACK, egos=(-1, -2)), r"egos\[0\] = -1: must be >= 0"),
         (lambda: replace(TRACK, egos=(0, 9)), "egos = 9: must be an index in 0..3"),
         (
