@@ -36,7 +36,6 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
 
 
 @lru_cache(maxsize=256)
-@lru_cache
 def fitting(measurement: Measurement, width: int) -> int | None:
     """The dimension whose z has `width` numbers; None if both have; InputError if none has."""
     widths = {d: measurement.width(d) for d in (2, 3) if d == 3 or measurement.plane is not None}
