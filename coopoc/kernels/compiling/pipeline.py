@@ -4,7 +4,7 @@ from typing import Any
 
 from numba._dynfunc import make_function
 from numba.core import types
-from numba.core.codegen import JITCodeLibrary
+from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.typed_passes import NopythonRewrites
 from numba.core.types.functions import BaseFunction
@@ -18,10 +18,19 @@ class KernelLibrary(JITCodeLibrary):
 
     def finalize(self) -> None:
         """Link what is called, and what that calls, once into what Python calls, and nothing into a part."""
-        called = self._linking_libraries
-        self._linking_libraries = [] if self.is_part else [*_all_called(called)]
+        called, self._linking_libraries = self._linking_libraries, []
+        if not self.is_part:
+            self._reload_init.update(*(library._reload_init for library in called))
+            _link(self._final_module, called)
         super().finalize()  # type: ignore[no-untyped-call]
         self._linking_libraries = called
+
+    def _get_module_for_linking(self) -> Any:
+        """What a function of numba's own links, such as an overload: a part with all that it calls."""
+        module = super()._get_module_for_linking()  # type: ignore[no-untyped-call]
+        if self.is_part:
+            _link(module := module.clone(), self._linking_libraries)
+        return module
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -37,15 +46,14 @@ class KernelLibrary(JITCodeLibrary):
         self._finalized = True
 
 
-def _all_called(libraries: Any) -> dict[Any, None]:
-    """Libraries in order, and those that wait in parts among them."""
-    found, left = dict[Any, None](), [*libraries]
+def _link(module: Any, libraries: Any) -> None:
+    """Link libraries, and those that wait in parts among them, each once."""
+    found, left = set[Any](), [*libraries]
     while left:
-        library = left.pop()
-        if library not in found and getattr(library, "is_part", False):
-            left += library._linking_libraries
-        found[library] = None
-    return found
+        if (library := left.pop()) not in found:
+            found.add(library)
+            left += library._linking_libraries if getattr(library, "is_part", False) else []
+            module.link_in(CPUCodeLibrary._get_module_for_linking(library), preserve=True)
 
 
 class KernelFlags(Flags):  # numba looks options up for every operation that it types
@@ -57,7 +65,8 @@ class KernelFlags(Flags):  # numba looks options up for every operation that it 
 
 UNUSED = InlineClosureLikes, NopythonRewrites
 """Passes for what no kernel has: closures, comprehensions and sums of whole arrays."""
-RESOLVE, KNOWN = BaseFunction.get_call_type, dict[Any, Any]()
+Called: Any = BaseFunction
+RESOLVE, KNOWN = Called.get_call_type, dict[Any, Any]()
 
 
 def _known_call(self: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -85,12 +94,12 @@ class Kernel(CompilerBase):
 
     def _compile_core(self) -> Any:
         self.state.flags, self.state.flags.no_compile = KernelFlags(self.state.flags), self.is_part  # type: ignore[no-untyped-call]
-        resolve = BaseFunction.get_call_type
-        BaseFunction.get_call_type = _known_call  # type: ignore[method-assign]
+        resolve = Called.get_call_type
+        Called.get_call_type = _known_call
         try:
             made = super()._compile_core()  # type: ignore[no-untyped-call]
         finally:
-            BaseFunction.get_call_type = resolve  # type: ignore[method-assign]
+            Called.get_call_type = resolve
         if self.is_part:
             desc, libraries = made.fndesc, (made.library,)
             key = make_function(desc.lookup_module(), desc.qualname, "", 0, made.environment, libraries)
