@@ -251,6 +251,7 @@ def test_poses_in_a_slab():
     first, *others = [solved(bound, backend) for backend in BOTH]
     for other in others:
         same_minimum(other, first)
+    same_minimum(solve(replace(bound, x0=pose(-at, 2.0))), first)
     r, J = problem.whiten(first.x)
     room = np.full((n, 3), INF)
     room[:, 1] = 0.5

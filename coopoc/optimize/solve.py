@@ -133,7 +133,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem = problem.replace_unchecked(constraints=constraints)
     result = backend.run(problem, start, options)
     if constraints:
-        told = whole or (has_start and abs(problem.cost(given) - problem.cost(result.x)) <= RIVAL_COST)
+        near = not has_start or abs(problem.cost(given) - problem.cost(result.x)) <= RIVAL_COST
+        told = whole or (near and not searching)
         problem, result = (problem, result) if told else _drawn(problem, backend, options, result, has_start)
     elif has_start:
         problem, result = _challenged(problem, backend, options, result, whole)
@@ -186,7 +187,7 @@ def _searched(problem: Problem, start: Floats, end: Floats | None, draws: bool) 
 def _drawn(
     problem: Problem, backend: Backend, options: Options, first: SolverResult, has_start: bool
 ) -> tuple[Problem, SolverResult]:
-    """The lowest feasible result of a problem with constraints, of the first, those from random places around it, and
+    """The lowest feasible result of a problem with constraints, of the first, of points those from random places, and
     beside a given x0 that from where the measurements lead; the problem's notes are of the minima that were found."""
     few, steps, search = {**options, "max_iterations": DRAWN_STEPS}, 0, problem.search
     free, around = problem.replace_unchecked(constraints=()), first.x
@@ -199,9 +200,11 @@ def _drawn(
         return end.x
 
     def cost(x: Floats) -> float:
-        return problem.cost(x) if constraint_rows(problem, x).outside.max() <= FEASIBLE else np.inf
+        return sparse(problem).cost(x) if constraint_rows(problem, x).outside.max() <= FEASIBLE else np.inf
 
-    x, ends = drawn(chain(led, islice(scattered(problem, around), QUIET_DRAWS)), first.x, descend, cost)
+    x, ends = drawn(
+        chain(led, islice(scattered(problem, around), 0 if problem.poses else QUIET_DRAWS)), first.x, descend, cost
+    )
     notes, start = doubts(x, ends, cost), search.start
     if x is not first.x:
         steps, start, first = steps + first.iterations, "drawn", backend.run(problem, x, options)
