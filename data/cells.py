@@ -20,7 +20,7 @@ from coopoc.formats.values import MAX_NUMBER
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLES = (".csv", ".parquet")
+TABLES = (".csv", ".parquet", ".jsonl")
 WHOLE = re.compile(r"^(\d+)\.0$")
 """What a spreadsheet or pandas makes of a whole number beside empty cells: 7.0 is the name 7."""
 MAX_COLUMNS = 5000
@@ -49,7 +49,7 @@ LARGEST_TABLE = 2**27
 
 
 def read_frame(path: Path, *text: str) -> "pd.DataFrame":
-    """Table of a .parquet or (any other ending) CSV file.
+    """Table of a .parquet, .jsonl (an object per line) or (any other ending) CSV file.
 
     Args:
         path: of the file; CSV between commas, or between semicolons or tabs with decimal commas.
@@ -61,7 +61,10 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     import pandas as pd
 
     try:
-        frame = _read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, text)
+        if path.suffix.lower() == ".jsonl":
+            frame = pd.read_json(path, lines=True, dtype=False, convert_dates=False, precise_float=True)
+        else:
+            frame = _read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
@@ -103,6 +106,8 @@ def headers(path: Path) -> list[str]:
     try:
         if path.suffix.lower() == ".csv":
             return [name.strip() for name in _first_lines(path)[1]]
+        if path.suffix.lower() == ".jsonl":
+            return [str(name) for name in read_frame(path)]
         from pyarrow.parquet import read_schema
 
         return [str(name) for name in read_schema(path).names]

@@ -328,6 +328,20 @@ def test_ranges_are_moved_to_their_step(tmp_path):
     assert_allclose(rec.relative[0, :, 0], -2 * x[rec.links.step], atol=1e-6)
 
 
+def test_ranges_and_bearings_are_moved_to_their_step_without_a_place(tmp_path):
+    """Closed form: on a circle of 30 m at 12 m/s, what a car measures of a mast 0.05 s after a step."""
+    t, turn = np.arange(90) / 10, 0.4j
+    mast, mean = 50 + 9j, np.sinc(0.02 / np.pi)  # speeds are that of a chord
+    at = [(mast + 30j * np.exp(turn * when)) * np.exp(-turn * when) for when in (t, t + 0.05)]
+    seen = pd.DataFrame({"t": t + 0.05, "partner": "mast", "range": np.abs(at[1]), "bearing": np.angle(at[1])})
+    own = pd.DataFrame({"t": t, "speed": 12 * mean, "yaw_rate": 0.4})
+    places = pd.DataFrame({"t": [0.0], "vehicle": "mast", "x": 50.0, "y": 9.0})
+    pd.concat([own.assign(vehicle="a"), seen.assign(vehicle="a"), places]).query("t < 3").to_csv(tmp_path / "log.csv")
+    rec = co.read_log(tmp_path / "log.csv", frame="body", dt=0.1).recording
+    there = at[0][rec.links.step]
+    assert_allclose(rec.relative[0, :, :2], np.column_stack([np.abs(there), np.angle(there)]), atol=0.01)
+
+
 def test_two_anchors_leave_the_side_open(tmp_path):
     librsf(tmp_path / "hall", True)
     file = tmp_path / "hall" / "Hall_Input.txt"

@@ -20,7 +20,7 @@ def when(t: Floats, marked: Bools) -> str:
     >>> when(np.arange(4.0), np.array([True, True, False, True]))
     '(0 to 1, 3 to 3 s)'
     """
-    times = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in stretches(marked)]
+    times = [f"{round(t[a], 3):.13g} to {round(t[b - 1], 3):.13g}" for a, b in stretches(marked)]
     more = f", and {len(times) - 3} times more" * (len(times) > 3)
     return f"({', '.join(times[:3])} s{more})"
 

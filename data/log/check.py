@@ -24,6 +24,7 @@ from .estimates import (
     LONG_LAG,
     OUTLYING,
     SURE_ERRORS,
+    TENTHS,
     against_truth,
     causes,
     factors,
@@ -41,7 +42,9 @@ from .relative import (
     LEAST_OUTLIERS,
     OUTLIER_SHARE,
     measurements,
+    misplaced,
     of_measurements,
+    of_places,
     of_ranges,
 )
 from .residuals import Check, filtered, without_wild
@@ -65,6 +68,8 @@ AXIS_TURN = 20.0
 """Degrees by which odometry is turned from which its forward axis is another."""
 PERHAPS = 2.0
 """Standard errors from which an error may be real, and is named as not known."""
+LEAST_BACK = 0.02
+"""Share of the way that a vehicle goes back, if it does."""
 DIVERGED = 0.3
 """Scale error of odometry beyond which the filter that estimates it has diverged."""
 USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
@@ -102,17 +107,15 @@ def check(log: Log) -> Check:
     rows = _vehicles(first)
     drifts = [first.world.ids.index(row["vehicle"]) for row in rows if _drifts(first, row)]
     alike = not drifts and not any(_beyond(row, "nis", OUTLYING) for row in rows)
-    result = on_time(first if log.recording.body else _without(first, drifts), alike)
+    true = None if log.truth is None or any(_late(first, row) for row in rows) else against_truth(first)
+    result = on_time(first if log.recording.body else _without(first, drifts), alike, true)
     result = replace(result, vehicles=_vehicles(result))
-    if (
-        log.truth is not None
-        and not any(_late(first, row) for row in result.vehicles)
-        and not result.ahead.any()
-        and not any(of_ranges(result))
-    ):
-        result = against_truth(result)
+    if log.truth is not None and not any(of_ranges(result)):
+        late = [row["vehicle"] for row in result.vehicles if _late(first, row)]
+        result = against_truth(result, [*late, *np.array(result.world.ids)[result.ahead != 0]])
     elif log.recording.body is None:  # odometry that errs says nothing of others
         result = _without(_wider(result), drifts)
+    result = misplaced(result)
     result = replace(result, measurements=measurements(result))
     named = [sentence for rule in CHECKS for sentence in rule(result)]
     return replace(result, warnings=(*_of_filters(result, named), *named), unseen=tuple(_unseen(result)))
@@ -123,7 +126,7 @@ def _failing(c: Check) -> dict[str, str]:
     rec = c.world
     corrections = faults(rec, np.arange(len(rec.ids)), NoiseModel.nominal(rec.sensors))
     steps = np.zeros((0, 0)) if corrections is None else failed(corrections, rec.dt).T
-    return {name: when(rec.t, each) for name, each in zip(rec.ids, steps, strict=False) if each.any()}
+    return {name: when(rec.t - rec.t[0], each) for name, each in zip(rec.ids, steps, strict=False) if each.any()}
 
 
 def _without(c: Check, columns: Sequence[int]) -> Check:
@@ -214,6 +217,26 @@ def _axes(c: Check, column: int) -> str:
     return ""
 
 
+def _noisier(c: Check, column: int) -> str:
+    """When fixes scatter far more than is stated and than they do else: second differences of what they are beside the
+    odometry, which slips hardly change; nothing where none do."""
+    rec = c.world
+    path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, axis=0)
+    off = pd.DataFrame(((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[:, :2]).dropna()
+    if c.shown(column) or len(off) < TENTHS * LEAST_COUNT / 2:
+        return ""
+    size = np.linalg.norm(off.diff().diff().shift(-1), axis=1) / 6**0.5 / (c.fix_noise * np.log(2) ** 0.5)
+    scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated
+    if scatter.max() < CONFIDENT_RATIO * max(1.0, scatter.median()):
+        return ""
+    t = rec.t - rec.t[0]
+    at = t[off.index[np.flatnonzero(size > 0.5 * scatter.max())]]
+    return (
+        f"its fixes scatter by {scatter.max():.2g} times what they state from {at[0]:.3g} to {at[-1]:.3g} s, as of a "
+        "receiver that has lost its base or satellites: give std columns that say so, or leave these out."
+    )
+
+
 def _of_rows(c: Check) -> Iterator[str]:
     """Measurements and columns that were left out."""
     summary = c.log.summary
@@ -263,6 +286,8 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
             f"{name}: {share:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: outliers, "
             "which a filter without a gate follows."
         )
+    noise = _noisier(c, column)
+    sentences += [f"{name}: {noise}"] * bool(noise)
     axes = _axes(c, column)
     sentences += [f"{name}: {axes}"] * bool(axes)
     if axes or any(what.startswith(FAULTS[1]) and name in who for what, who in c.log.summary.assumed.items()):
@@ -302,7 +327,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         moved, driven, *_ = moves(c, column)
         back = np.abs(moved + driven) < 0.5 * np.abs(moved)
         cause = "slips, or a speed or heading that is held or wrong."
-        if back.sum() >= 3:
+        if back.sum() >= 3 and back.mean() > LEAST_BACK:
             cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
         sentences.append(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
     elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
@@ -327,6 +352,8 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         sentences.append(
             f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
             "as stated, or correlated in time. Give std columns or sensors=."
+            + " Were variances given as deviations?"
+            * bool(0.8 < nis * c.fix_noise / 2**0.5 < 1.25)
         )
     return sentences
 
@@ -484,6 +511,7 @@ CHECKS: tuple[Callable[[Check], Iterable[str]], ...] = (
     _of_rows,
     _of_clocks,
     of_ranges,
+    of_places,
     _of_vehicles,
     _of_fixes,
     of_measurements,

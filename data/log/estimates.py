@@ -1,5 +1,6 @@
 """Errors of a log's clocks, odometry, antennas and pairs, with standard errors by parts of the drive."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -84,13 +85,12 @@ def factors(
     if groups is not None:
         frame = pd.DataFrame(all_of)
         all_of = (frame - frame.groupby(groups).transform("mean")).to_numpy()
-    y, x, both = all_of[:, 0], all_of[:, 1 : k + 1], all_of[:, None, : k + 1]
-    products = (all_of[:, k + 1 :, None].conj() * both).real
+    y, x, z = all_of[:, 0], all_of[:, 1 : k + 1], all_of[:, k + 1 :].conj()
 
     def fitted(used: Bools) -> Floats:
         factor = np.zeros(k)
         for _ in range(3):
-            sums = products[used].sum(axis=0)
+            sums = (z[used].T @ all_of[used, : k + 1]).real
             factor = np.linalg.lstsq(sums[:, 1:], sums[:, 0])[0]
             gap = np.abs(y - x @ factor)
             used = used & (gap <= OUTLYING * np.median(gap[used]))
@@ -313,6 +313,13 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
     value, error = factors(c.relative[there, 0], x, noise, groups, z)
     measured = np.flatnonzero(ends[there].any(axis=0))
+    if len(x):  # the filters' errors may last for the drive
+        apart = x[:, size:] - pd.DataFrame(x[:, size:]).groupby(groups).transform("mean").to_numpy()
+        stay = max(float(np.mean(c.expected[there, 0] ** 2)) - c.world.sensors.range_std**2, 0.0) * share(c)
+        vehicles = max(len(measured), 1)
+        error[size:] = np.hypot(
+            error[size:], np.sqrt(stay / vehicles / np.maximum(np.square(apart).mean(axis=0), 1e-12))
+        )
     error[measured[measured == reference]] = 0.0
     if reference is None and len(measured):
         apart = np.abs(np.subtract.outer(value[measured], value[measured]))
@@ -368,22 +375,27 @@ def lag_of_fixes(c: Check, column: int) -> float:
 
 
 def _beside(off: AnyArray, velocity: AnyArray) -> float:
-    """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none."""
+    """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none. At
+    one velocity a lag is no explanation."""
     finite = np.isfinite(off + velocity)
     x = np.column_stack([np.ones(finite.sum()), velocity[finite]])
-    return float(abs(np.linalg.lstsq(x, off[finite])[0][0]))
+    beside = abs(np.linalg.lstsq(x, off[finite])[0][0])
+    return float(min(beside, abs(off[finite].mean())) if finite.any() else 0.0)
 
 
-def against_truth(c: Check) -> Check:
+def against_truth(c: Check, late: Sequence[str] = ()) -> Check:
     """The same, with ranges, and directions by headings that are known, against the truth where both ends have one that
-    their fixes fit, or one stands as a landmark; without those of vehicles whose fixes do not fit."""
+    their fixes fit, or one stands without a truth; without those of vehicles whose fixes do not fit, and as they are of
+    those that are `late`. Positions are those of the truth, where it counts."""
     truth, rec, noise = c.log.truth, c.world, c.world.sensors
     if truth is None:
         return c
-    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks)
+    still = (np.nan_to_num(rec.velocity[0]) == 0.0).all(axis=(0, 2))
+    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (still & ~truth.present.any(axis=0))
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
-    x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
+    on_time = ~np.isin(rec.ids, late)
+    x = np.where(marks[:, None], c.x, np.where((fits & on_time)[:, None], truth.position, np.nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
     if c.log.recording.body is None:
         stated[1] = noise.world_azimuth_std
@@ -393,19 +405,24 @@ def against_truth(c: Check) -> Check:
         residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
     used = np.isfinite(residual)
     relative = np.where(used, residual, c.relative)
-    fit = (fits | marks)[[rec.links.observer, rec.links.neighbour]].all(axis=0)
+    fit = (fits | marks | ~on_time)[[rec.links.observer, rec.links.neighbour]].all(axis=0)
     relative[~fit] = np.nan  # of others nothing is known
-    return replace(c, relative=relative, expected=np.where(used, stated, c.expected))
+    x = np.where(np.isfinite(x), x, c.x)
+    return replace(c, x=x, relative=relative, expected=np.where(used, stated, c.expected))
 
 
-def on_time(c: Check, alike: bool) -> Check:
-    """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share, and
-    less what wrong ones explain."""
+def on_time(c: Check, alike: bool, true: Check | None = None) -> Check:
+    """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share (of
+    `true` positions, if any), and less what wrong ones explain."""
     (value, error), made = clocks(c, alike)
-    size, maybe = len(c.world.ids), np.abs(value) > 2.0 * error
+    size = len(c.world.ids)
+    if alike and true is not None:
+        value[size:], error[size:] = (part[size:] for part in clocks(true, True)[0])
+    maybe = np.abs(value) > 2.0 * error
     if alike and not (maybe[size:].any() and abs(value[size]) < UNITS_APART):  # clocks look like it, or undo it
         return on_time(c, False)
     least = np.where(np.arange(size + 2) == size, LEAST_SCALE, LEAST_LAG)
+    error[:size][np.abs(value[:size]) > LONG_LAG] = np.inf  # what is linear in a lag holds for small ones
     off = np.where(np.abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ off)

@@ -56,6 +56,10 @@ def check_origin(origin: Origin) -> None:
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
     """Rows whose stamps go on where those of a vehicle begin anew after one of PERIODS; those of another file, such as
     the truth, may count on."""
+    clock = rows.groupby("file", sort=False)["t"].transform(of_clock_face)
+    if not clock.equals(rows["t"]):
+        rows = rows.assign(t=clock)
+        summary.assume("stamps are hours, minutes and seconds, hhmmss.ss: no number is of the seconds 60 to 99")
     t, last = rows["t"], rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
     back = t < last
     for period in PERIODS:
@@ -71,6 +75,26 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
             "anew, whose parts are logs of their own; rows are in their order"
         )
     return rows
+
+
+def of_clock_face(t: "pd.Series[float]") -> "pd.Series[float]":
+    """Seconds of the day of times hhmmss.ss, as NMEA writes them: where no number is of the seconds 60 to 99, and those
+    between which a minute begins are 40 further apart than others. Other times are as they were.
+
+    >>> of_clock_face(pd.Series([235957.0, 235958.5, 235959.5, 235959.9])).tolist()[-1]
+    235959.9
+    >>> of_clock_face(pd.Series([15957.0, 15958.0, 15959.0, 20000.0, 20001.0])).diff().tolist()[1:]
+    [1.0, 1.0, 1.0, 1.0]
+    """
+    each = np.unique(t.dropna())
+    minutes, seconds = each // 100 % 100, each % 100
+    gaps = np.diff(each)
+    begins = np.diff(minutes) != 0
+    usual = float(np.median(gaps[~begins])) if begins.any() and not begins.all() else np.inf
+    face = np.max([minutes, seconds], initial=0.0) < 60 and each.max(initial=0.0) < 240000
+    if not (face and usual < 60.0 and abs(np.median(gaps[begins] % 4000) - 40.0) <= 1.5 * usual < 40.0):
+        return t
+    return 3600.0 * (t // 10000) + 60.0 * (t // 100 % 100) + t % 100
 
 
 def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:

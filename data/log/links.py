@@ -194,9 +194,9 @@ def _to_step(
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
     their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_MOTIONS times
-    lag du. Nothing is moved where g or du is not known. In body frames a bearing grows by lag w, too, with the
-    observer's yaw rate w. And which are as long as the longest range, where most of these fall short of g by more
-    than `std`.
+    lag du. Nothing is moved where g or du is not known, but ranges and bearings of one time to what stands, which give
+    g from the observer. In body frames a bearing grows by lag w, too, with the observer's yaw rate w. And which are as
+    long as the longest range, where most of these fall short of g by more than `std`.
     """
     velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*LINK_COLUMNS, "component"))
@@ -207,8 +207,6 @@ def _to_step(
         """(M, ...) means over the step in which each time lies; of the one before where the member is absent then."""
         return of_step[np.where(np.isnan(velocity[after, column, 0]), step, after), column]
 
-    if steps.body:
-        value = np.where(component == 1, value + lag * during(rate, observer), value)
     path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
     last = last_true(np.isfinite(fixes[..., 0]))
     position = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
@@ -216,6 +214,16 @@ def _to_step(
     then = now + lag[:, None] * (during(velocity, neighbour) - during(velocity, observer))
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
+    if steps.body:
+        at = table.set_index(["t", "observer", "neighbour"])
+        both = at.pivot(columns="component", values="value").reindex(columns=[0, 1]).reindex(at.index).to_numpy().T
+        forward, left = during(stacked(members, "velocity"), observer)[:, :2].T
+        vector = both[0] * np.exp(1j * both[1])
+        moved_vector = vector + lag * (forward + 1j * left)
+        less = np.column_stack([np.abs(moved_vector) - both[0], np.angle(moved_vector * vector.conj()), 0.0 * lag])
+        stands = np.array([member.stands for member in members.values()])[neighbour] & np.isnan(change[:, 0])
+        change = np.where(stands[:, None], less, change)
+        value = np.where(component == 1, value + lag * during(rate, observer), value)
     distance = np.where(component == 0, value, np.inf)
     away = np.linalg.norm(now, axis=1)
     full = (component == 0) & (value == value[component == 0].max(initial=0.0))

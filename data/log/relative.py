@@ -1,18 +1,31 @@
 """Relative measurements of a log against positions: scale, lateness, outliers, wrong partners, offsets of pairs."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import Floats, Ints, robust_std
+from coopoc.arrays import AnyArray, Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
-from .estimates import LAG_STEP, LEAST_COUNT, LONGEST_LAG, MOVED_STDS, OUTLYING, SURE_ERRORS, median, pairs, share
+from .estimates import (
+    LAG_STEP,
+    LEAST_COUNT,
+    LONG_LAG,
+    LONGEST_LAG,
+    MOVED_STDS,
+    OUTLYING,
+    SURE_ERRORS,
+    factors,
+    median,
+    pairs,
+    share,
+)
 from .frames import UNSTATED
 from .motion import MOVING
-from .residuals import Check, plane
+from .residuals import Check, plane, residual_of
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE_RATIO, NARROW_RATIO = 2.0, 0.4
@@ -33,6 +46,8 @@ LASTS_STDS = 0.6
 """Standard deviations of two fixes by which receivers may be off for long, over OUTLYING."""
 MEDIAN_WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
+PLACE_ERRORS, GAUSS_NEWTON = 6.0, 4
+"""Standard errors from which a member stands elsewhere; steps that find where."""
 WRONG_SHARE, NAMED_CASES, MISFITS = 0.8, 4, 500
 """Share of a part of a drive in which something is wrong, and of the drive that such a part may be; cases that a
 sentence names; measurements that show what they are of."""
@@ -67,6 +82,24 @@ def measurements(c: Check) -> list[dict[str, Any]]:
     return rows
 
 
+def of_places(c: Check) -> Iterator[str]:
+    """Members that stand elsewhere than their fix says."""
+    at = dict(zip(c.world.ids, plane(np.nan_to_num(c.x)[-1]), strict=True))
+    like = {
+        name: [
+            other
+            for other in at
+            if other != name and abs(at[name] + away - at[other]) < max(3 * error, 0.1 * abs(away))
+        ]
+        for name, (away, error) in c.places.items()
+    }
+    yield from (
+        f"{name}: it stands {away.real:+.2f} m east and {away.imag:+.2f} m north of its fix, +- {error:.2f} m, by what "
+        f"measures it{f': there is {like[name][0]}. Are names exchanged?' if like[name] else '. Correct its place.'}"
+        for name, (away, error) in c.places.items()
+    )
+
+
 def of_ranges(c: Check) -> Iterator[str]:
     """What all ranges share that positions contradict."""
     (scale, unsure), (late, error) = c.ranges
@@ -80,6 +113,53 @@ def of_ranges(c: Check) -> Iterator[str]:
             f"ranges are {abs(late):.3f} +- {error:.3f} s {'late' if late > 0 else 'early'} beside fixes and odometry: "
             "stamp them when they are measured."
         )
+
+
+def misplaced(c: Check) -> Check:
+    """The same with members that stand elsewhere than their fix says, m east + i north and its standard error, and
+    relative measurements less that. The surest is taken off first: beside it, others seem to be off."""
+    links, ids = c.world.links, c.world.ids
+    gap, _ = residual_of(c.world, c.x)
+    flat, up, places = plane(gap), gap[:, 2], dict[str, tuple[complex, float]]()
+    measured = c.relative[:, :2] + np.column_stack([np.hypot(np.abs(flat), up), np.angle(flat)])
+    known = c.expected[:, 0] ** 2 - c.world.sensors.range_std**2
+    lasts = np.nan_to_num(known).clip(0.0) * share(c)  # m^2, errors of filters that last for the drive
+    left = {*np.flatnonzero((np.nan_to_num(c.world.velocity[0]) == 0.0).all(axis=(0, 2))).tolist()}
+
+    def misses(rows: Ints, vector: AnyArray) -> Floats:
+        """(M, 2) m, rad by which ranges and directions miss a vector (M,)."""
+        miss = measured[rows] - np.column_stack([np.hypot(np.abs(vector), up[rows]), np.angle(vector)])
+        return np.column_stack([miss[:, 0], wrap(miss[:, 1])])
+
+    def moved(column: int) -> tuple[float, int, complex, float, Ints, AnyArray]:
+        """How far it is away, in standard errors and as it is, its standard error, its links and vectors to it then."""
+        rows = np.flatnonzero((links.observer == column) | (links.neighbour == column))
+        sign, partner = np.where(links.neighbour[rows] == column, 1.0, -1.0), (links.observer + links.neighbour)[rows]
+        away, error, group = 0j, np.inf, np.column_stack([2 * partner, 2 * partner + 1]).ravel()
+        for _ in range(GAUSS_NEWTON):
+            vector = flat[rows] + away * sign
+            std = c.expected[rows, :2] * np.column_stack([np.ones(len(rows)), far := np.maximum(np.abs(vector), 1.0)])
+            y = (misses(rows, vector) / c.expected[rows, :2]).ravel()
+            unit = ((vector / far * sign)[:, None] * [1.0, 1j] / std).ravel()
+            there = np.isfinite(y)
+            if there.sum() < LEAST_COUNT or not (away or np.median(np.abs(y[there])) > 1.0):
+                return 0.0, column, 0j, np.inf, rows, vector
+            x = np.column_stack([unit.real, unit.imag])[there]
+            value, unsure = factors(y[there], x, 1.0, group[there])
+            away, others = away + complex(*value), len(np.unique(partner))
+            error = float(np.hypot(np.linalg.norm(unsure), (lasts[rows].mean() / others) ** 0.5))
+        return abs(away) / max(error, 1e-12), column, away, error, rows, flat[rows] + away * sign
+
+    while left:
+        ratio, column, away, error, rows, vector = max(map(moved, left), key=lambda one: one[0])
+        if ratio < PLACE_ERRORS or abs(away) < c.world.sensors.range_std:
+            break
+        left.remove(column)
+        places[ids[column]], flat[rows] = (away, error), vector
+    if not places:
+        return c
+    relative = np.column_stack([misses(np.arange(len(flat)), flat), c.relative[:, 2]])
+    return replace(c, relative=relative, places=places)
 
 
 def of_measurements(c: Check) -> Iterator[str]:
@@ -132,8 +212,12 @@ def of_measurements(c: Check) -> Iterator[str]:
             ends = set.intersection(*map(set, misfits))
             one = "".join(ends) if len(ends) == 1 else ""
             worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:NAMED_CASES]
+            clocks = np.array([-ahead if pair[0] != one else ahead for pair, (_, _, ahead) in misfits.items()])
             yield (
-                f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
+                f"{one}: its clock is {abs(np.median(clocks)):.1f} s {'ahead of' if clocks[0] > 0 else 'behind'} the "
+                f"others' by all {word}s that are off: clock={one}:{np.median(clocks):.1f}, and check again."
+                if one and np.ptp(clocks) < LONG_LAG
+                else f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
                 f"{', '.join(' to '.join(pair) + misfits[pair][1] for pair in worst_of)}"
                 f"{', ...' * (len(misfits) > NAMED_CASES)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
                 "position or clock, or a value that is held."
@@ -144,7 +228,12 @@ def of_measurements(c: Check) -> Iterator[str]:
             yield (
                 f"{word}s of {shown} are off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
-                + (f"offset={offsets_text} takes it off." if word == "range" else f"offset=NAME.{word}: takes it off.")
+                + (
+                    f"offset={offsets_text} takes it off."
+                    if word == "range"
+                    else f"if of all that one measures, offset={pairs[0][0].split(' to ')[0]}.{word}:{pairs[0][1]:.3g} "
+                    "takes it off (named and in the unit as logged)."
+                )
             )
         if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):
             size, std_of = ("less", max(noise, MIN_STD_SHARE * least)) if noise < least else ("more", noise)
@@ -156,9 +245,9 @@ def of_measurements(c: Check) -> Iterator[str]:
             )
 
 
-def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
-    """Who measures whom -> by what that is off where it is for long, though an offset is taken off; and in words, with
-    whom else it fits."""
+def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]]:
+    """Who measures whom -> by what that is off where it is for long, though an offset is taken off; in words, with whom
+    else it fits; and s by which the observer's clock is ahead if that explains it, else NaN."""
     links, ids, measured = c.world.links, c.world.ids, c.world.relative[0, :, 0]
     misfit_of = {}
     t, names = c.world.t - c.world.t[0], pairs(c, k, True)
@@ -178,11 +267,11 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         places = np.concatenate([c.x[steps[:, 0]], c.x[then, other]], axis=1)  # of all, and of its own before and later
         far = np.linalg.norm(places - c.x[steps, one], axis=2)
         miss = pd.DataFrame(np.abs(far - measured[some, None])).median().fillna(np.inf)
-        best = int(miss.argmin())
+        best, ahead = int(miss.argmin()), np.nan
         if k == 0 and miss[best] < WIDE_RATIO * np.median(expected) < 0.2 * size:
-            clock = f"its clock was {lags[best - len(ids)]:+.1f} s beside the other's"
-            text += f", as if {f'to {ids[best]}' if best < len(ids) else clock}"
-        misfit_of[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
+            ahead = np.nan if best < len(ids) else float(lags[best - len(ids)])
+            text += f", as if {f'to {ids[best]}' if best < len(ids) else f'its clock was {ahead:+.1f} s ahead'}"
+        misfit_of[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}", ahead
     return misfit_of
 
 
@@ -194,9 +283,15 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
         offset, error = median(c.relative[rows, k])
         position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
         error = float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
-        if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated):
+        if abs(offset) > max(SURE_ERRORS * np.hypot(error, _unsure_place(c, str(pair))), 0.25 * stated):
             named.append((str(pair), offset, error))
     return sorted(named, key=lambda row: -abs(row[1]))
+
+
+def _unsure_place(c: Check, pair: str) -> float:
+    """m, standard error of where one of a pair stands, if it is misplaced."""
+    ends = pair.replace(" and ", " to ").split(" to ")
+    return max((error for name, (_, error) in c.places.items() if name in ends), default=0.0)
 
 
 def _other_angle(c: Check) -> str:

@@ -45,6 +45,7 @@ class Check:
         ranges: share by which they are too long, s by which they are late, 0 where not sure; each with its standard
             error.
         wild: (N,) fixes that were left out: beyond WILD_STDS times the vehicle's usual innovation.
+        places: members that stand elsewhere -> by how much, m east + i north, and its standard error.
         failing: vehicles whose odometry fixes correct -> when, in words.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
@@ -67,6 +68,7 @@ class Check:
     unsure: Floats
     wild: Ints
     ranges: tuple[tuple[float, float], ...] = ()
+    places: Mapping[str, tuple[complex, float]] = field(default_factory=dict)
     failing: Mapping[str, str] = field(default_factory=dict)
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
