@@ -20,7 +20,6 @@ class KernelLibrary(JITCodeLibrary):
         """Link what is called, and what that calls, once into what Python calls, and nothing into a part."""
         called, self._linking_libraries = self._linking_libraries, []
         if not self.is_part:
-            self._reload_init.update(*(library._reload_init for library in called))
             _link(self._final_module, called)
         super().finalize()  # type: ignore[no-untyped-call]
         self._linking_libraries = called
