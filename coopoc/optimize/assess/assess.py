@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
-from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
+from ..algebra.sparse import Entries, shared_layout, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, unchecked
 from ..model.problem import Problem, linearised, several
@@ -84,32 +84,31 @@ def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = F
     array([1.e+16, 1.e+16, 1.e+16])
     """
     if not problem.constraints:
-        return _unconstrained(problem, sparse(problem), x, covariance, quick and not problem.linear)
-    (linear, J), shape = linearised(problem, x), problem.movable.shape
+        return _unconstrained(problem, x, covariance, quick and not problem.linear)
+    (linear, J), still = linearised(problem, x), ~problem.movable
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
-    active = active_at(problem, x, gradient.reshape(shape))
+    active = active_at(problem, x, gradient.reshape(still.shape))
     size = float(np.linalg.norm(gradient + active.rows.matrix.T @ active.multipliers))
-    still = ~problem.movable
     try:
-        cov, dx, sound = _marginals(with_still(J.T @ J, still), gradient, shape, active)
+        cov, dx, sound = _marginals(J, still, gradient, active)
         if (stated := as_stated(problem)) is not problem:
-            J_stated = linearised(stated, x)[1]
-            cov = _marginals(with_still(J_stated.T @ J_stated, still), gradient, shape, active)[0]
+            cov = _marginals(linearised(stated, x)[1], still, gradient, active)[0]
     except np.linalg.LinAlgError:
         sound = False
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
-        unknown = np.full((*shape, shape[1]), np.nan)
+        unknown = np.full((*still.shape, still.shape[1]), np.nan)
         return Assessment(linear.cost, size, unknown, np.nan, _unobservable(problem, J, active), active)
     cov = cov * ~(still[:, :, None] | still[:, None, :])
     return Assessment(linear.cost, size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
 
 
-def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool, quick: bool = False) -> Assessment:
+def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = False) -> Assessment:
     """The assessment of a problem without constraints.
 
     A pivot is the information of an unknown with those before it eliminated and those after it given, so that its
     inverse is no larger than the variance: along a free direction one is rounding.
     """
+    system = sparse(problem)
     cholesky, entries = system.cholesky, system.entries
     cost, gradient, values = system.quadratic(x, "newton" if quick else "gauss-newton")
     none = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
@@ -131,7 +130,7 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
         if (variance * own < INFLATION).all():
             return replace(ended(cov, step), newton=quick)
     if quick:
-        return _unconstrained(problem, system, x, covariance)
+        return _unconstrained(problem, x, covariance)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
         scale, steepness = own + (own == 0), _largest(problem, entries, np.abs(gradient))
@@ -177,7 +176,7 @@ def _symmetric(entries: Entries, values: Floats) -> Any:
     return half + triu(half, 1).T
 
 
-def _marginals(hessian: Any, gradient: Floats, shape: tuple[int, int], active: Active) -> tuple[Floats, Floats, bool]:
+def _marginals(J: Any, still: Bools, gradient: Floats, active: Active) -> tuple[Floats, Floats, bool]:
     """Marginals under the equalities, the Gauss-Newton step along what holds, and whether the former are bounded.
 
     With Z the directions that remain: cov = Z (Z^T J^T J Z)^-1 Z^T, and the step solves the same system after the least
@@ -186,7 +185,7 @@ def _marginals(hessian: Any, gradient: Floats, shape: tuple[int, int], active: A
     Raises:
         numpy.linalg.LinAlgError: a matrix that is not positive definite.
     """
-    exact, onto = active.exact, active.onto
+    exact, onto, hessian, shape = active.exact, active.onto, with_still(J.T @ J, still), still.shape
     dx = onto - _within(hessian, active.along)[0](gradient + hessian @ onto)
     solve, own = _within(hessian, exact)
     cov = np.zeros((*shape, shape[1]))
@@ -321,22 +320,13 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
     """True unless the Lagrangian of a problem curves downwards at x (n, ambient) within what `active` allows.
 
     Z^T (H + sum_c m_c d2 h_c / dx2) Z is positive definite, H the Hessian of the cost, m the multipliers and Z the
-    directions that remain. The far side of a range that must be met is a stationary point too, and a maximum.
-    Source: Nocedal and Wright, Numerical Optimization, 2nd ed., theorem 12.6.
+    directions that remain, eased by SLACK. The far side of a range that must be met is a stationary point too, and a
+    maximum. Source: Nocedal and Wright, Numerical Optimization, 2nd ed., theorem 12.6.
     """
     if problem.linear and all(c.measurement.linear for c in problem.constraints):
         return True
     if active.along.shape[0] == active.along.shape[1]:  # no direction is taken away
         return newton_decrease(problem.replace_unchecked(constraints=()), x) is not None
-    within = active.along.T @ _lagrangian(problem, x, active) @ active.along
-    return not within.shape[0] or cholesky_of(within) is not None
-
-
-def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
-    """(n dof, n dof) sparse exact Hessian of the Lagrangian at x (n, ambient), eased by SLACK, 1 for what cannot
-    move."""
-    from scipy.sparse import csr_array
-
     system, structure, rows = sparse(problem), structure_of(problem), active.rows.origin
     terms, numbers = list(structure.factors), list(system.numbers)
     for k, (item, term) in enumerate(zip(problem.constraints, structure.constraints, strict=True)):
@@ -345,12 +335,12 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
         numbers.append(numbers_of(reweighed(as_factor(item), weight)))
         terms.append(term._replace(kind=term.kind._replace(bound=True)))
     layout = shared_layout(structure._replace(factors=tuple(terms), constraints=()))
-    entries, size = layout.entries, system.size
-    values = layout.total("newton", x, numbers)[size + 1 : -1]
+    entries, values = layout.entries, layout.total("newton", x, numbers)[system.size + 1 : -1]
     values[entries.diagonal] += SLACK * system.quadratic(x, "gauss-newton")[2][system.entries.diagonal]
-    moving = np.flatnonzero(entries.number.ravel() >= 0)
-    into = csr_array((np.ones(size), (moving, np.arange(size))), shape=(entries.number.size, size))
-    return with_still(into @ _symmetric(entries, values) @ into.T, ~problem.movable)
+    moving = problem.movable.ravel()
+    ways, still = active.along[moving], active.along[~moving]
+    within = ways.T @ _symmetric(entries, values) @ ways + still.T @ still
+    return not within.shape[0] or cholesky_of(within) is not None
 
 
 def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple[str, ...]]:
@@ -375,9 +365,8 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
             continue
         square = squared(problem, factor, x)
         beyond = factor.loss.weight(square) < INLIER_WEIGHT
-        count = int(beyond.sum())
-        spent += 0.5 * float(factor.loss.cost(square[beyond]).sum())
-        if count:
+        if count := int(beyond.sum()):
+            spent += 0.5 * float(factor.loss.cost(square[beyond]).sum())
             rejected.append((f"{factor.loss.name} loss", count, len(square), f"measurements {factor.kind}"))
             out += int(factor.measured[beyond].sum())
     mean, variance = expected(problem, unknowns + out)
@@ -497,10 +486,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
         hint = "Measure what is free: see solution.unobservable."
         raise InputError("problem", repr(problem), "must hold all nodes", hint)
     wanted = system.entries.number[places].ravel()
-    moving = np.flatnonzero(wanted >= 0)
-    whole = np.zeros((len(wanted), len(wanted)))
-    unit = np.zeros((system.size, len(moving)))
-    unit[wanted[moving], np.arange(len(moving))] = 1.0
-    if len(moving):
-        whole[np.ix_(moving, moving)] = columns_solved(system.cholesky, unit)[wanted[moving]]
+    unit = (np.arange(system.size)[:, None] == wanted).astype(float)
+    solved = columns_solved(system.cholesky, unit) if places else unit
+    whole = np.pad(solved, ((0, 1), (0, 0)))[wanted]  # the last row for what cannot move
     return whole.reshape(len(places), dof, len(places), dof).swapaxes(1, 2)
