@@ -55,11 +55,11 @@ from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
-from .world.outliers import Fault as Fault
-from .world.outliers import Outliers as Outliers
 from .world.recording import Body as Body
 from .world.recording import Recording as Recording
 from .world.sensing import observe as observe
+from .world.sensors import Fault as Fault
+from .world.sensors import Outliers as Outliers
 from .world.sensors import Sensors as Sensors
 from .world.v2x import V2X as V2X
 from .world.v2x import Message as Message

@@ -25,10 +25,9 @@ from coopoc.study.study import Params, Row
 from coopoc.study.style import NOT_CAUSAL_SUFFIX
 from coopoc.workers import progress_bar
 
-from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
 from .pose_drives import POSES
-from .roads import PUBLISHED, ROADS, holds, road_row, roads
+from .roads import CONVOYS, PUBLISHED, ROADS, convoy_row, holds, road_row, roads
 from .tasks import LOGGED, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
 from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 

@@ -7,26 +7,26 @@ import pytest
 from conftest import measured, refused
 
 import coopoc as co
-from coopoc.studies import benchmark, convoys, roads
+from coopoc.studies import benchmark, roads
 
 TASKS = ("convoy-kitti", "convoy-f9k", "convoy-comma2k19")
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_vehicles_err_as_the_pieces_of_the_drive(task):
-    for name in roads.ROADS[convoys.CONVOYS[task]]:
+    for name in roads.ROADS[roads.CONVOYS[task]]:
         measured(name)
-    recording, fleet = convoys.convoy(task, measured())
-    drive, truth = roads.thinned(convoys.CONVOYS[task], measured())
+    recording, fleet = roads.convoy(task, measured())
+    drive, truth = roads.thinned(roads.CONVOYS[task], measured())
     column, count, length = drive.observers[0], len(fleet.ids), len(fleet.t)
     assert count == (2 if task == "convoy-comma2k19" else 4)
     assert count * length <= len(drive.t)
     assert np.isfinite(recording.gnss[:, 0]).all()
     start = np.linalg.norm(fleet.position[0] - fleet.position[0].mean(axis=0), axis=-1)
-    assert start.max() < 2 * convoys.START_SPREAD
+    assert start.max() < 2 * roads.START_SPREAD
     error = (recording.gnss[0] - fleet.position)[..., :2]
     real = (drive.gnss[0, :, column] - truth.position[:, column])[:, :2]
-    begins = convoys._pieces(drive, column)[0]
+    begins = roads._pieces(drive, column)[0]
     for k, begin in enumerate(begins):
         piece = real[begin : begin + length]
         known = np.isfinite(piece[:, 0])
@@ -47,7 +47,7 @@ def test_star_filters_get_rows_on_convoys(tmp_path):
     measured("KITTI_00_gt.txt")
     assert benchmark.benchmark(("joint", "kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
     joint, alone = (json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "kalman"))
-    recording, fleet = convoys.convoy("convoy-kitti", measured())
+    recording, fleet = roads.convoy("convoy-kitti", measured())
     track = co.JointFilter()(recording, recording.ids)
     gap = (track.x - fleet.position)[..., :2]
     assert joint["rt_le_m"][0] == pytest.approx(np.sqrt(np.square(gap).sum(-1).mean()), rel=0.15)  # a mean over blocks

@@ -17,7 +17,7 @@ from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
-from coopoc.optimize.robust.candidates import mark
+from coopoc.optimize.robust.graduated import mark
 from coopoc.optimize.robust.loop_closures import predicted
 from coopoc.optimize.solver_commands import solve_file
 

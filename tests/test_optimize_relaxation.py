@@ -18,9 +18,9 @@ from unseen_graphs import World
 
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Solution, Status, solve
-from coopoc.optimize.convex import certify, reduced, shor
+from coopoc.optimize.convex import certify, relaxation, shor
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
-from coopoc.optimize.convex.reduced import Reduced
+from coopoc.optimize.convex.relaxation import Reduced
 from coopoc.optimize.graph_problems import from_graph, read_graph
 from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import exp
@@ -200,7 +200,7 @@ def test_the_elimination_is_numpys(make, monkeypatch):
     L = multipliers(form, X, small.times(X))
     (a,) = small.smallest(L)
     assert a == pytest.approx(np.linalg.eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
-    monkeypatch.setattr(reduced, "FORMED_ROWS", 0)
+    monkeypatch.setattr(relaxation, "FORMED_ROWS", 0)
     large = Reduced(form)
     assert large.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
     (b,) = large.smallest(L)

@@ -16,9 +16,8 @@ from small_runs import files, numbers, shown
 
 import coopoc as co
 from coopoc.cli import _status
-from coopoc.study.compute import WorkerDiedError, compute, schedule
 from coopoc.study.publish import views
-from coopoc.study.run import plan, run_study
+from coopoc.study.run import WorkerDiedError, compute, plan, run_study, schedule
 from coopoc.study.study import Cell, Study
 from coopoc.world.storage import save_recording
 

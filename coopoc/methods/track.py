@@ -13,8 +13,7 @@ import numpy as np
 from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, named, number, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
-from ..world.fleet import columns, same_drive
-from ..world.long_table import long_table
+from ..world.fleet import columns, long_table, same_drive
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 

@@ -26,8 +26,7 @@ from .starts.graph_starts import (
     position_variance,
     rotation_variance,
 )
-from .starts.initial import directed
-from .starts.pose_starts import graph_of
+from .starts.initial import directed, graph_of
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]

@@ -12,9 +12,9 @@ from ..arrays import listed
 from ..errors import InputError
 from ..paths import given_path, inside, write
 from ..text import uncontrolled
-from .manifest import environments
 from .publish import views
 from .results import Results
+from .store import environments
 from .style import look, title, words
 from .tables import Table
 

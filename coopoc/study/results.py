@@ -16,7 +16,6 @@ from ..paths import given_path
 from ..text import short_repr
 from . import store
 from .cell import Params
-from .manifest import read
 from .style import METHODS, OWN_NAMES
 
 SEED = "train_seed"
@@ -64,10 +63,10 @@ class Results:
             folder: of the study.
 
         Raises:
-            InputError: as `coopoc.study.manifest.read`.
+            InputError: as `coopoc.study.store.read`.
         """
         folder = given_path(folder)
-        manifest = read(folder)
+        manifest = store.read(folder)
         done, failed, pending = [], [], 0
         for name in manifest.cells:
             table = store.load(folder, name)

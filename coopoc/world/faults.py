@@ -8,8 +8,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, last_true
 from .fleet import Fleet
 from .links import Links, spherical, wrap
-from .outliers import Fault, Outliers
-from .sensors import stream
+from .sensors import Fault, Outliers, stream
 
 Pairs = Sequence[tuple[str, str, Ints, Ints]]
 """Observer id, neighbour id, indices of its links, and their steps."""

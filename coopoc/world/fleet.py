@@ -1,18 +1,20 @@
-"""Fleet: the ground truth of N vehicles that drive; their unique names and equally spaced instants."""
+"""Fleet: the ground truth of N vehicles that drive, their unique names, equally spaced instants; tables of pandas."""
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, check_arrays, check_fields, checked, listed, number, refuse, remade
+from ..arrays import AnyArray, Bools, Floats, check_arrays, check_fields, checked, listed, number, refuse, remade
 from ..errors import InputError, shown, unknown
-from .long_table import long_table
 from .plausible import MAX_POSITION, MAX_SPEED, headings, plausible
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -236,3 +238,20 @@ def interval(t: Floats) -> float:
     0.1
     """
     return round(float((t[-1] - t[0]) / (len(t) - 1)), 9)
+
+
+def long_table(columns: Mapping[str, AnyArray], where: Bools | None = None) -> "pd.DataFrame":
+    """A row per element of the arrays' common shape, the last axis fastest.
+
+    Args:
+        columns: name -> array that broadcasts to the common shape.
+        where: of the common shape, the elements to keep; all if None.
+
+    >>> long_table({"t": np.array([[0.0], [0.1]]), "x": np.array([[1.0, 2], [3, 4]])}).to_numpy().tolist()
+    [[0.0, 1.0], [0.0, 2.0], [0.1, 3.0], [0.1, 4.0]]
+    """
+    import pandas as pd
+
+    kept = ... if where is None else where
+    arrays = np.broadcast_arrays(*columns.values())
+    return pd.DataFrame({name: array[kept].reshape(-1) for name, array in zip(columns, arrays, strict=True)})

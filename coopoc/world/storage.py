@@ -16,9 +16,8 @@ from ..errors import InputError, said
 from ..paths import given_path, write
 from .fleet import Fleet, same_drive
 from .links import Links
-from .outliers import Fault, Outliers
 from .recording import Body, Recording
-from .sensors import Sensors
+from .sensors import Fault, Outliers, Sensors
 from .v2x import V2X
 
 ARRAYS = (

@@ -42,7 +42,7 @@ from tqdm import tqdm
 
 import coopoc as co
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.studies.convoys import CONVOYS, convoy
+from coopoc.studies.roads import CONVOYS, convoy
 from coopoc.studies.worlds import world
 
 TRAINING = 200_000

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise
-from .factor import Constraint, Factor, stacked, taken, unchecked
-from .inputs import check_rotations
+from .factor import Constraint, Factor, check_rotations, stacked, taken, unchecked
 from .measurements import lookup
 from .space import Space
 from .window import Noise, window

@@ -18,8 +18,7 @@ from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
 from ..starts.initial import initial_guess
-from .candidates import Candidates, bounds, mark
-from .graduated import LAST_MU, Graduation, contest, graduate
+from .graduated import LAST_MU, Candidates, Graduation, bounds, contest, graduate, mark
 from .loop_closures import known_start
 
 Start = Literal["any", "known"]

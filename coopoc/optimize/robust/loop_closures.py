@@ -14,9 +14,8 @@ from ..model.factor import taken
 from ..model.problem import Problem, restricted, rows_among
 from ..model.space import carried
 from ..starts.graph_starts import parts
-from ..starts.initial import initial_guess
-from ..starts.pose_starts import along_poses
-from .candidates import Inner, Marked
+from ..starts.initial import along_poses, initial_guess
+from .graduated import Inner, Marked
 
 MAX_JOINS = 2
 """Times that a candidate may join: one that a wrong neighbour has displaced returns once that is gone."""

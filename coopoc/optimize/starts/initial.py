@@ -1,13 +1,22 @@
-"""Where to start: the linear least-squares solution of the converted measurements."""
+"""Where to start: the linear least-squares solution of the converted measurements; of poses without an x0 the graph of
+what is measured, along which they hang together.
+"""
+
+from collections import defaultdict
+from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats, Ints
 from ...errors import InputError
+from ...formats.graph import NAME, Graph, edges_of
+from ...formats.values import to_orientation
 from ..algebra.sparse import sparse
 from ..model.derivatives import linearise
 from ..model.factor import Factor, as_factor, bounded, stacked
+from ..model.measurements import converted_rows
 from ..model.problem import Problem
+from .graph_starts import parts, walk, with_points
 
 NUDGE_STD = 0.1
 """m or rad, standard deviation of such a move."""
@@ -69,3 +78,85 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
         bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
         undefined += [(item, item.nodes[bad])] if bad.any() else []
     return undefined
+
+
+FIELDS = {
+    "pose": "pose_prior",
+    "relative_pose": "relative_pose",
+    "relative_position": "relative_point",
+    "body_spherical": "relative_point",
+    "position": "point_prior",
+    "range": "ranges",
+}
+"""Kinds of a graph's edges, by the kind of a factor without what follows its name."""
+UNMEASURED_WEIGHT = 1e-9
+"""1/m^2 or 1/rad^2, of a component that is not measured."""
+
+
+def graph_of(problem: Problem) -> Graph:
+    """The graph of what a problem measures, and of where it fixes nodes; what a graph has no edge for is left out.
+
+    >>> problem = Problem(("here", "there"), dimension=2, poses=(0,)).add("position", "there", [3.0, 4.0], std=1.0)
+    >>> graph_of(problem.add("range", ("here", "there"), 5.0, std=0.1))
+    Graph(2-D: 1 poses of 1 robots, 1 points; 1 point_prior, 1 ranges)
+    """
+    d, n, poses = problem.dimension, len(problem.names), np.isin(np.arange(len(problem.names)), problem.poses)
+    rows = defaultdict[str, list[Any]](list)
+    for factor in problem.factors:
+        field = _field(factor)
+        used = factor.informative & (~poses[factor.nodes[:, -1]] if "point" in field else True)
+        if field and used.any():
+            rows[field].append([part[used] for part in (factor.nodes, *_measured(problem, factor))])
+    edges = {}
+    for field, own in rows.items():
+        nodes, values, covariance = map(np.concatenate, zip(*own, strict=True))
+        edges[field] = edges_of(field, nodes, values, covariance, ())
+    names, still = problem.names, list(problem.fixed)
+    at, orientation = np.full((n, d), np.nan), np.full((n, 1 if d == 2 else 4), np.nan)
+    if problem.x0 is not None and problem.poses:
+        held = problem.x0[still]
+        at[still], orientation[still] = problem.space.position(held), to_orientation(problem.space.rotation(held))
+    if not all(map(NAME.fullmatch, names)):
+        part = parts(n, *(nodes for nodes, *_ in rows["relative_pose"]))
+        names = tuple(f"{chr(65 + part[k] % 26)}{k}" for k in range(n))
+    return Graph(d, names, poses, at, orientation, fixed=still, **edges)  # type: ignore[arg-type]
+
+
+def along_poses(problem: Problem) -> Floats:
+    """x0 (n, ambient) with poses where relative poses lead, from fixed poses, then from others, and points without a
+    fix where a pose sees them, or by ranges.
+
+    The start of a graph may follow measurements that have no weight here.
+    """
+    graph, space, x = graph_of(problem), problem.space, initial_guess(problem)
+    roots = [(k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses)]
+    position, rotation, placed = walk(graph, np.ones(len(graph.relative_pose), dtype=bool), roots)
+    position[~placed], rotation[~placed] = space.position(x[~placed]), space.rotation(x[~placed])
+    return with_points(graph, position, rotation, placed)[:, : space.ambient]
+
+
+def joining(problem: Problem) -> list[Ints]:
+    """Of each factor that holds nodes in one body, their pairs: relative poses, and points that a pose sees."""
+    every = [(f, f.nodes[f.informative]) for f in problem.factors if _field(f).startswith("relative")]
+    points = np.setdiff1d(np.arange(len(problem.names)), problem.poses)
+    return [n if f.measurement.compares_poses else n[np.isin(n[:, 1], points)] for f, n in every]
+
+
+def _field(factor: Factor) -> str:
+    return FIELDS.get(factor.kind.removesuffix("_chordal").removesuffix("_log"), "")
+
+
+def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
+    """Values and covariances of a factor as a graph's edges have them, the same along all axes and about them."""
+    d, space, root, z = problem.dimension, problem.space, factor.root, factor.z
+    if factor.kind == "body_spherical":  # as vectors with the rotated covariance
+        distance, rows = converted_rows([*z.T], np)
+        axes = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        root, z = root @ axes, distance[:, None] * axes[:, 0]
+    information = np.square(root).sum(axis=1) + UNMEASURED_WEIGHT
+    variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
+    if factor.measurement.compares_poses:
+        z = np.concatenate([space.position(z), to_orientation(space.rotation(z))], axis=1)
+        turn = 1.0 / information[:, d:].mean(axis=1, keepdims=True)
+        variance = np.concatenate([variance, np.repeat(turn, space.angles, axis=1)], axis=1)
+    return z, variance[:, :, None] * np.eye(variance.shape[1])

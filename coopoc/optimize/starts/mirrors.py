@@ -13,7 +13,7 @@ from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
 from ..model.space import exp, log, nearest_rotation
 from .graph_starts import averaging, crossings, parts, position_variance, rotation_variance
-from .pose_starts import graph_of
+from .initial import graph_of
 
 RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""

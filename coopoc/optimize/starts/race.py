@@ -12,9 +12,8 @@ from ..model.factor import reweighed
 from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
-from .initial import directed
+from .initial import directed, joining
 from .mirrors import RANGES, Cost, Descend, across, rewound
-from .pose_starts import joining
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
