@@ -21,8 +21,7 @@ from coopoc.learned.nets.gain import Recurrent, flatten
 from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.training.clients import Segments, clients
 from coopoc.learned.training.fit import descend
-from coopoc.learned.training.machine import one_core
-from coopoc.learned.training.schedule import Schedule
+from coopoc.learned.training.schedule import Schedule, one_core
 
 ROUNDS = 5
 RATE = 1e-3

@@ -21,7 +21,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
-from coopoc.learned.federation.participation import Participation
+from coopoc.learned.federation.federate import Participation
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method

@@ -2,9 +2,8 @@
 
 from . import torch_installed as torch_installed
 from .checkpoint import Checkpoint, load, save
-from .federation.federate import federate
+from .federation.federate import Participation, federate
 from .federation.history import Federation, ledger
-from .federation.participation import Participation
 from .method import LearnedGain
 from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
@@ -12,9 +11,8 @@ from .nets.okf import NoiseParameters, OptimisedKF
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
 from .training.clients import Client, Segments, clients
-from .training.drives import MeasuredDrives
+from .training.drives import MeasuredDrives, measured_clients
 from .training.fit import Fit, fit
-from .training.measured import measured_clients
 from .training.schedule import Schedule
 
 __all__ = [

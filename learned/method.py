@@ -18,7 +18,7 @@ from coopoc.methods.track import Alone, Track, in_stretches
 from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
-from .training.machine import one_core
+from .training.schedule import one_core
 
 
 class GainStream:

@@ -19,8 +19,7 @@ from .checkpoint import load
 from .federation.federate import Plan
 from .nets.gain import Gain
 from .training.clients import Client, Start, check_pieces, clients
-from .training.drives import Drives, MeasuredDrives
-from .training.measured import measured_clients
+from .training.drives import Drives, MeasuredDrives, measured_clients
 from .training.schedule import COUNT_LIMITS, Schedule
 
 REVISION = 7

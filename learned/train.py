@@ -26,7 +26,7 @@ from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
 from .training.fit import Judge, fit, fit_okf
-from .training.machine import LINE
+from .training.schedule import LINE
 
 LEAST_STD = 1e-6
 """m, of noise that is fitted, and share of a velocity."""

@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose
 from torch import Tensor
 
 from coopoc.learned import GainNet
+from coopoc.learned.engine.backward import Moments, Update
 from coopoc.learned.engine.layers import sigmoid, tanh
-from coopoc.learned.engine.optimiser import Moments, Update
 from coopoc.learned.nets.gain import Gain, Recurrent, flatten
 from coopoc.learned.training.clients import Batch
-from coopoc.learned.training.machine import one_core
+from coopoc.learned.training.schedule import one_core
 
 
 @pytest.fixture(autouse=True)

@@ -18,15 +18,19 @@ from torch import Tensor, nn
 from coopoc import Fleet, Sensors
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
-from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
+from coopoc.learned.federation.federate import Participation
 from coopoc.learned.federation.history import Federation, Round, ledger
-from coopoc.learned.federation.participation import Participation
 from coopoc.learned.federation.rules import (
     RULES,
+    SERVER,
+    Answer,
     Krum,
     Rule,
+    Standing,
     TrimmedMean,
+    combine,
     rule,
+    screen,
 )
 from coopoc.learned.nets.gain import Gain, flatten
 from coopoc.learned.training.clients import Batch

@@ -24,7 +24,7 @@ from coopoc.errors import MissingLibraryError
 from coopoc.learned import clients, federate, load
 from coopoc.learned.federation.history import Federation
 from coopoc.learned.flower import client_app, rounds
-from coopoc.learned.flower.job import job_of
+from coopoc.learned.flower.client import job_of
 from coopoc.learned.flower.server import Row, federation
 from coopoc.learned.recipes import RECIPES, Job, Setting, job_clients, untrained
 

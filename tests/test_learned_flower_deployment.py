@@ -28,7 +28,7 @@ from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.learned import load
 from coopoc.learned.federation.federate import adapt
-from coopoc.learned.flower.job import job_of
+from coopoc.learned.flower.client import job_of
 from coopoc.learned.recipes import Job, job_clients, untrained
 
 TINY = {"local-epochs": 1, "piece": 10, "net-in-mult": 2, "net-out-mult": 1}

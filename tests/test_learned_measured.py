@@ -26,8 +26,7 @@ from coopoc.learned.checkpoint import read_card
 from coopoc.learned.nets.gain import flatten
 from coopoc.learned.recipes import RECIPES
 from coopoc.learned.training.clients import Batch
-from coopoc.learned.training.drives import MeasuredDrives
-from coopoc.learned.training.measured import measured_clients
+from coopoc.learned.training.drives import MeasuredDrives, measured_clients
 
 NETS = (GainNet(2, 1), NoiseParameters())
 

@@ -11,7 +11,7 @@ from torch import nn
 from coopoc import Fleet, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.learned.nets.gain import Recurrent
-from coopoc.learned.training.machine import one_core
+from coopoc.learned.training.schedule import one_core
 from coopoc.methods.track import Method
 
 

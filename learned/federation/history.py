@@ -16,7 +16,7 @@ from coopoc.evaluate.ledger import of_training
 from coopoc.text import short_repr
 
 from ..nets.gain import Gain, unflatten
-from .combine import SERVER
+from .rules import SERVER
 
 AGREEMENT = 0.1
 """Excess of a round's median loss over the least one up to which the round may be selected."""

@@ -1,27 +1,81 @@
-"""ClientApp of a vehicle: it trains received weights on its own drive and answers with weights and numbers."""
+"""ClientApp of a vehicle: it trains received weights on its own drive and answers with weights and numbers; and the job
+of a run's configuration.
+"""
 
+import json
 import os
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import fields, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
-from coopoc import InputError, MissingLibraryError, load_fleet, read_log
+from coopoc import MissingLibraryError, load_fleet, read_log
+from coopoc.errors import InputError, unknown
 
 from ..federation.federate import adapt
-from ..recipes import Job, job_clients, untrained
+from ..recipes import Job, Recipe, Setting, job_clients, recipe_of, untrained
 from ..training.clients import Client
 from ..training.drives import drives_of
 from ..training.fit import Judge
-from ..training.machine import one_core
-from .job import job_of
+from ..training.schedule import Schedule, one_core
 
 if TYPE_CHECKING:
     from flwr.app import Context, Message, RecordDict
     from flwr.clientapp import ClientApp
+
+PREFIX = "net-"
+"""Before the name of an option of the net."""
+
+
+def job_of(config: Mapping[str, Any]) -> Job:
+    """The job of a run's configuration.
+
+    Args:
+        config: recipe (a name), seed, start, reading, and differences from the recipe: fields of `Recipe` and
+            `Schedule` written with dashes, such as local-epochs, and options of the net, such as net-in-mult. The entry
+            `change` holds such fields as words: "rounds=3 net-in-mult=2". Other entries are ignored.
+
+    Raises:
+        InputError: an unknown recipe, one that is no federation, or an unknown field in `change`.
+
+    >>> from coopoc.learned.flower.client import job_of
+    >>> job = job_of({"recipe": "fedkalmannet", "seed": 3, "change": "rounds=2 net-in-mult=5", "nodes": 4})
+    >>> job.setting.seed, job.recipe.rounds, job.recipe.options
+    (3, 2, (('in_mult', 5),))
+    """
+    name = config["recipe"]
+    base = recipe_of(name)
+    if base.kind != "federated":
+        raise InputError("recipe", repr(name), f'is "{base.kind}", must be "federated"', "Train it without Flower.")
+    settings = {key.replace("-", "_"): value for key, value in {**config, **_words(config.get("change", ""))}.items()}
+    options = {key[len(PREFIX) :]: value for key, value in settings.items() if key.startswith(PREFIX.replace("-", "_"))}
+    own = {} if settings.get("net", base.net) != base.net else dict(base.options)
+    schedule, changed = replace(base.schedule, **_of(Schedule, settings)), tuple((own | options).items())
+    recipe = replace(base, **_of(Recipe, settings), schedule=schedule, options=changed)
+    return Job(name, recipe, Setting(**_of(Setting, settings)))
+
+
+def _words(text: str) -> dict[str, Any]:
+    """The changes of a text such as "rounds=3 aggregate=median"."""
+    allowed, settings = {field.name.replace("_", "-") for kind in (Recipe, Schedule) for field in fields(kind)}, {}
+    for word in text.split():
+        key, _, value = word.partition("=")
+        if key not in allowed and not key.startswith(PREFIX):
+            raise unknown("change", key, [*sorted(allowed), f"{PREFIX}..."])
+        settings[key] = value
+        with suppress(json.JSONDecodeError):
+            settings[key] = json.loads(value)
+    return settings
+
+
+def _of(kind: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {field.name: settings[field.name] for field in fields(kind) if field.name in settings}
+
 
 Source: TypeAlias = "Callable[[Context], tuple[Client, Job]]"
 

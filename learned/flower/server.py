@@ -17,13 +17,11 @@ from coopoc.paths import given_path
 from coopoc.text import visible
 
 from ..checkpoint import Checkpoint, read_card, save
-from ..federation.combine import SERVER, screen, too_few
 from ..federation.history import Federation, Round
-from ..federation.rules import rule
+from ..federation.rules import SERVER, rule, screen, too_few
 from ..nets.gain import Gain, flatten
 from ..recipes import Job, untrained
-from .client import require_flower
-from .job import job_of
+from .client import job_of, require_flower
 
 if TYPE_CHECKING:
     from flwr.app import Context, Message

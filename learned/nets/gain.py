@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from coopoc import Method
 from coopoc.arrays import Floats, number
 
-from ..engine.optimiser import Moments, Outcome, Update, advance
+from ..engine.backward import Moments, Outcome, Update, advance
 from ..method import LearnedGain
 from ..training.clients import Batch, Segments
 

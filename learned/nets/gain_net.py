@@ -1,16 +1,18 @@
-"""GainNet: the three-GRU KalmanNet gain for a position state with a velocity control."""
+"""GainNet: the three-GRU KalmanNet gain for a position state with a velocity control, by steps and compiled."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import number, seed_of
+from coopoc.arrays import AnyArray, number, seed_of
+from coopoc.errors import InputError
 
-from ..engine import rollout as engine
-from ..engine.layers import CELLS, SHORTEST_LENGTH, STATE_SIZE
-from ..engine.optimiser import Moments, Outcome, Update
+from ..engine import backward, forward
+from ..engine.backward import Moments, Outcome, Update
+from ..engine.forward import Drives
+from ..engine.layers import CELLS, SHORTEST_LENGTH, STATE_SIZE, plan_of
 from ..training.clients import Batch
 from .gain import Recurrent, size
 
@@ -82,12 +84,31 @@ class GainNet(Recurrent):
             self.gain.bias.copy_(start_gain * torch.eye(STATE_SIZE).flatten())
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
-        return engine.loss_and_gradient(theta, self.shapes, batch)
+        """Loss (S,) m^2, the mean over the batch, and its gradient (S, P) at theta (S, P); errors as `rollout`.
+
+        References:
+            Werbos, Proc. IEEE 1990 (backpropagation through time).
+
+        >>> still = torch.zeros(5, 1, 2, 3)
+        >>> GainNet().loss_and_gradient(torch.zeros(1, 19938), Batch(still, still, still, still[0], 0.1))[0]
+        tensor([0.])
+        """
+        update = Update(np.arange(len(theta)), 0, np.empty(0), 0.0, 0.0)
+        outcome = self.descend(Moments(*[_array(theta, theta.dtype)] * 3), batch, update)
+        return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.gradient)
 
     def descend(self, moments: Moments, batch: Batch, update: Update) -> Outcome:
         """One optimiser step as in `Gain`; each model goes from rollout to new weights before the next one begins."""
-        return engine.descend(moments, self.shapes, batch, update)
+        theta, plan, models = torch.from_numpy(moments.theta), plan_of(self.shapes), len(update.rows)
+        drives = self._checked(theta, models, batch.gnss, batch.velocity, batch.x0, batch.dt)
+        truth = _array(batch.truth, theta.dtype)
+        if truth.shape != drives.gnss.shape:
+            hint = "Give one position per fix."
+            raise InputError("truth", f"shape {truth.shape}", f"must be {drives.gnss.shape}", hint)
+        gradient, losses = np.empty((models, plan.places.shape[1]), truth.dtype), np.empty(models, truth.dtype)
+        outcome = Outcome(gradient, losses, np.empty(models, np.bool_))
+        backward.descend(moments, plan, drives, truth, outcome, update)
+        return outcome
 
     def start(self, x0: Tensor) -> Memory:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""
@@ -131,13 +152,57 @@ class GainNet(Recurrent):
         return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
 
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (T, S, B, 3) m as in `Recurrent`; compiled where no gradient is wanted."""
+        """Estimates (T, S, B, 3) m as in `Recurrent`; compiled where no gradient is wanted.
+
+        x_t = x_{t-1} + dt u_t + K_t (z_t - x_{t-1} - dt u_t). The numbers of a model do not depend on the others.
+
+        Raises:
+            InputError: arrays that do not fit together, or theta neither float32 nor float64 in main memory.
+
+        References:
+            arXiv 2411.05847, equations 4-6.
+
+        >>> still = torch.zeros(5, 1, 2, 3)
+        >>> GainNet().rollout(torch.zeros(1, 19938), still, still, still[0], 0.1).abs().max().item()
+        0.0
+        """
         if torch.is_grad_enabled() and theta.requires_grad:
             return super().rollout(theta, gnss, velocity, x0, dt)
-        return engine.rollout(theta, self.shapes, gnss, velocity, x0, dt)
+        drives = self._checked(theta, len(theta), gnss, velocity, x0, dt)
+        x = np.empty_like(drives.gnss)
+        forward.forward(_array(theta, theta.dtype), plan_of(self.shapes), drives, x)
+        return torch.from_numpy(x)
+
+    def _checked(self, theta: Tensor, models: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: Any) -> Drives:
+        """The inputs of so many models as contiguous arrays of theta's dtype."""
+        if theta.dtype not in (torch.float32, torch.float64) or theta.device.type != "cpu":
+            actual = f"{theta.dtype} on {theta.device}"
+            raise InputError("theta", actual, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
+        steps, lanes = gnss.shape[0], gnss.shape[2]
+        wanted = {
+            "theta": (theta, (len(theta), plan_of(self.shapes).places.shape[1])),
+            "gnss": (gnss, (steps, models, lanes, 3)),
+            "velocity": (velocity, (steps, models, lanes, 3)),
+            "x0": (x0, (models, lanes, 3)),
+        }
+        for name, (array, shape) in wanted.items():
+            if array.shape != shape:
+                raise InputError(name, f"shape {tuple(array.shape)}", f"must be {shape}", "See rollout.")
+        fixes, speeds, start = (_array(each, theta.dtype) for each in (gnss, velocity, x0))
+        spans = np.asarray(dt, fixes.dtype)
+        if spans.shape not in ((), (steps,)):
+            raise InputError("dt", f"shape {spans.shape}", f"must be one number or ({steps},)", "Give s per step.")
+        return Drives(fixes, speeds, start, np.broadcast_to(spans, steps).copy())
 
 
 def _direction(change: Tensor) -> Tensor:
     """Changes (B, 3) m divided by their lengths, zero where there is none."""
     length = torch.linalg.vector_norm(change, dim=1, keepdim=True)
     return torch.where(length > SHORTEST_LENGTH, change / length.clamp_min(SHORTEST_LENGTH), 0.0)
+
+
+def _array(tensor: Tensor, dtype: torch.dtype) -> AnyArray:
+    """The same numbers as a contiguous array, without a copy where possible."""
+    if tensor.dtype != dtype or not tensor.is_contiguous() or tensor.requires_grad:
+        tensor = tensor.detach().to(dtype).contiguous()
+    return tensor.numpy()

@@ -20,7 +20,7 @@ from coopoc.text import short_repr
 from coopoc.world.recording import Vehicles, check_recording
 
 from ..training.clients import Batch, Segments
-from ..training.machine import one_core
+from ..training.schedule import one_core
 from .gain import Gain, flatten, over_time, squared_error
 
 

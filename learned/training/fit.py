@@ -15,12 +15,11 @@ from coopoc.arrays import Floats, Ints, instance
 from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
-from ..engine.optimiser import Moments, Update
+from ..engine.backward import Moments, Update
 from ..nets.gain import Gain, flatten, over_time, unflatten
 from ..nets.okf import NoiseParameters, log_scale, scan
 from .clients import Batch, Segments, mirrored
-from .machine import one_core, watched
-from .schedule import Schedule, cosine, generator
+from .schedule import Schedule, cosine, generator, one_core, watched
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,18 @@
-"""Schedule: how a net is optimised; plans of batches and rates."""
+"""Schedule: how a net is optimised, plans of batches and rates; one core per process, a line of the terminal."""
 
 import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
 
 from coopoc.arrays import Floats, Ints, Limits, check_fields
+from coopoc.errors import InputError, shown
+from coopoc.workers import progress_bar
 
 Epoch = Literal["step", "pass"]
 COUNT_LIMITS, POSITIVE_LIMITS = (1, 10**7, "> 0"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
@@ -68,3 +73,30 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
 def generator(draw: np.random.Generator) -> torch.Generator:
     """A torch generator seeded by a keyed NumPy stream."""
     return torch.Generator().manual_seed(int(draw.integers(2**62)))
+
+
+Item = TypeVar("Item")
+LINE = ContextVar("line", default=0)
+"""Of the terminal, for bars: processes side by side do not draw over each other."""
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """One torch thread inside, the caller's number afterwards.
+
+    The matrices of a rollout are too small to share: a second thread mostly waits, and on a busy machine it makes a
+    step ten times slower. One thread also adds in one order, so weights do not depend on the machine's cores.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def watched(items: Iterable[Item], name: str | None, unit: str, total: int | None = None) -> Iterator[Item]:
+    """The items, with a bar of that name on stderr; None: without."""
+    if not isinstance(name, str | None):
+        raise InputError("progress", shown(name), "must be the name of a stage", "Give None for no bar.")
+    return iter(progress_bar(items, desc=name, unit=unit, total=total, disable=name is None, position=LINE.get()))
