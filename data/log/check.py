@@ -47,7 +47,7 @@ from .relative import (
     of_places,
     of_ranges,
 )
-from .residuals import Check, filtered, without_wild
+from .residuals import Check, filtered, without, without_wild
 
 WRONG_UNITS = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
@@ -107,14 +107,13 @@ def check(log: Log) -> Check:
     rows = _vehicles(first)
     drifts = [first.world.ids.index(row["vehicle"]) for row in rows if _drifts(first, row)]
     alike = not drifts and not any(_beyond(row, "nis", OUTLYING) for row in rows)
-    true = None if log.truth is None or any(_late(first, row) for row in rows) else against_truth(first)
-    result = on_time(first if log.recording.body else _without(first, drifts), alike, true)
+    late = [row["vehicle"] for row in rows if _late(first, row)]
+    result = on_time(first if log.recording.body else without(first, drifts), alike, against_truth(first, late))
     result = replace(result, vehicles=_vehicles(result))
     if log.truth is not None and not any(of_ranges(result)):
-        late = [row["vehicle"] for row in result.vehicles if _late(first, row)]
         result = against_truth(result, [*late, *np.array(result.world.ids)[result.ahead != 0]])
     elif log.recording.body is None:  # odometry that errs says nothing of others
-        result = _without(_wider(result), drifts)
+        result = without(_wider(result), drifts)
     result = misplaced(result)
     result = replace(result, measurements=measurements(result))
     named = [sentence for rule in CHECKS for sentence in rule(result)]
@@ -125,15 +124,10 @@ def _failing(c: Check) -> dict[str, str]:
     """Vehicles whose odometry fixes correct, and when."""
     rec = c.world
     corrections = faults(rec, np.arange(len(rec.ids)), NoiseModel.nominal(rec.sensors))
-    steps = np.zeros((0, 0)) if corrections is None else failed(corrections, rec.dt).T
-    return {name: when(rec.t - rec.t[0], each) for name, each in zip(rec.ids, steps, strict=False) if each.any()}
-
-
-def _without(c: Check, columns: Sequence[int]) -> Check:
-    """The same without relative measurements of these vehicles."""
-    links = c.world.links
-    ends = np.isin(links.observer, columns) | np.isin(links.neighbour, columns)
-    return replace(c, relative=np.where(ends[:, None], np.nan, c.relative))
+    if corrections is None:
+        return {}
+    steps = zip(rec.ids, failed(corrections, rec.dt).T, strict=True)
+    return {name: when(rec.t - rec.t[0], each) for name, each in steps if each.any()}
 
 
 def _wider(c: Check) -> Check:
@@ -220,17 +214,14 @@ def _axes(c: Check, column: int) -> str:
 def _noisier(c: Check, column: int) -> str:
     """When fixes scatter far more than is stated and than they do else: second differences of what they are beside the
     odometry, which slips hardly change; nothing where none do."""
-    rec = c.world
+    rec, t = c.world, c.world.t - c.world.t[0]
     path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, axis=0)
-    off = pd.DataFrame(((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[:, :2]).dropna()
-    if c.shown(column) or len(off) < TENTHS * LEAST_COUNT / 2:
-        return ""
-    size = np.linalg.norm(off.diff().diff().shift(-1), axis=1) / 6**0.5 / (c.fix_noise * np.log(2) ** 0.5)
+    off = pd.DataFrame((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[[0, 1]].dropna()
+    size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / (c.fix_noise * (6 * np.log(2)) ** 0.5)
     scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated
-    if scatter.max() < CONFIDENT_RATIO * max(1.0, scatter.median()):
+    if len(off) < TENTHS * LEAST_COUNT / 2 or scatter.max() < CONFIDENT_RATIO * max(1.0, scatter.median()):
         return ""
-    t = rec.t - rec.t[0]
-    at = t[off.index[np.flatnonzero(size > 0.5 * scatter.max())]]
+    at = t[off.index[size > 0.5 * scatter.max()]]
     return (
         f"its fixes scatter by {scatter.max():.2g} times what they state from {at[0]:.3g} to {at[-1]:.3g} s, as of a "
         "receiver that has lost its base or satellites: give std columns that say so, or leave these out."
@@ -286,10 +277,8 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
             f"{name}: {share:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: outliers, "
             "which a filter without a gate follows."
         )
-    noise = _noisier(c, column)
-    sentences += [f"{name}: {noise}"] * bool(noise)
     axes = _axes(c, column)
-    sentences += [f"{name}: {axes}"] * bool(axes)
+    sentences += [f"{name}: {sentence}" for sentence in (_noisier(c, column), axes) if sentence]
     if axes or any(what.startswith(FAULTS[1]) and name in who for what, who in c.log.summary.assumed.items()):
         return sentences
     if _beyond(row, "fixes_late_s", BEHIND):

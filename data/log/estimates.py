@@ -313,13 +313,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
     value, error = factors(c.relative[there, 0], x, noise, groups, z)
     measured = np.flatnonzero(ends[there].any(axis=0))
-    if len(x):  # the filters' errors may last for the drive
-        apart = x[:, size:] - pd.DataFrame(x[:, size:]).groupby(groups).transform("mean").to_numpy()
-        stay = max(float(np.mean(c.expected[there, 0] ** 2)) - c.world.sensors.range_std**2, 0.0) * share(c)
-        vehicles = max(len(measured), 1)
-        error[size:] = np.hypot(
-            error[size:], np.sqrt(stay / vehicles / np.maximum(np.square(apart).mean(axis=0), 1e-12))
-        )
+    stay = max(noise**2 - c.world.sensors.range_std**2, 0.0) * share(c) / max(len(measured), 1)
+    varied = pd.DataFrame(x[:, size:]).groupby(groups).transform("var", ddof=0).mean().clip(1e-12)
+    error[size:] = np.hypot(error[size:], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
     error[measured[measured == reference]] = 0.0
     if reference is None and len(measured):
         apart = np.abs(np.subtract.outer(value[measured], value[measured]))
@@ -383,15 +379,14 @@ def _beside(off: AnyArray, velocity: AnyArray) -> float:
     return float(min(beside, abs(off[finite].mean())) if finite.any() else 0.0)
 
 
-def against_truth(c: Check, late: Sequence[str] = ()) -> Check:
+def against_truth(c: Check, late: Sequence[str]) -> Check:
     """The same, with ranges, and directions by headings that are known, against the truth where both ends have one that
     their fixes fit, or one stands without a truth; without those of vehicles whose fixes do not fit, and as they are of
     those that are `late`. Positions are those of the truth, where it counts."""
     truth, rec, noise = c.log.truth, c.world, c.world.sensors
     if truth is None:
         return c
-    still = (np.nan_to_num(rec.velocity[0]) == 0.0).all(axis=(0, 2))
-    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (still & ~truth.present.any(axis=0))
+    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (c.still & ~truth.present.any(axis=0))
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
     on_time = ~np.isin(rec.ids, late)
@@ -411,16 +406,16 @@ def against_truth(c: Check, late: Sequence[str] = ()) -> Check:
     return replace(c, x=x, relative=relative, expected=np.where(used, stated, c.expected))
 
 
-def on_time(c: Check, alike: bool, true: Check | None = None) -> Check:
-    """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share (of
-    `true` positions, if any), and less what wrong ones explain."""
+def on_time(c: Check, alike: bool, true: Check) -> Check:
+    """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share (by
+    `true` positions, if there are some), and less what wrong ones explain."""
     (value, error), made = clocks(c, alike)
     size = len(c.world.ids)
-    if alike and true is not None:
+    if alike and c.log.truth is not None:
         value[size:], error[size:] = (part[size:] for part in clocks(true, True)[0])
     maybe = np.abs(value) > 2.0 * error
     if alike and not (maybe[size:].any() and abs(value[size]) < UNITS_APART):  # clocks look like it, or undo it
-        return on_time(c, False)
+        return on_time(c, False, true)
     least = np.where(np.arange(size + 2) == size, LEAST_SCALE, LEAST_LAG)
     error[:size][np.abs(value[:size]) > LONG_LAG] = np.inf  # what is linear in a lag holds for small ones
     off = np.where(np.abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)

@@ -87,12 +87,10 @@ def of_clock_face(t: "pd.Series[float]") -> "pd.Series[float]":
     [1.0, 1.0, 1.0, 1.0]
     """
     each = np.unique(t.dropna())
-    minutes, seconds = each // 100 % 100, each % 100
-    gaps = np.diff(each)
-    begins = np.diff(minutes) != 0
-    usual = float(np.median(gaps[~begins])) if begins.any() and not begins.all() else np.inf
-    face = np.max([minutes, seconds], initial=0.0) < 60 and each.max(initial=0.0) < 240000
-    if not (face and usual < 60.0 and abs(np.median(gaps[begins] % 4000) - 40.0) <= 1.5 * usual < 40.0):
+    gaps, begins = np.diff(each), np.diff(each // 100) != 0
+    if not begins.any() or begins.all() or each[-1] >= 240000 or np.max([each // 100 % 100, each % 100]) >= 60:
+        return t
+    if not abs(np.median(gaps[begins] % 4000) - 40.0) <= 1.5 * np.median(gaps[~begins]) < 40.0:
         return t
     return 3600.0 * (t // 10000) + 60.0 * (t // 100 % 100) + t % 100
 

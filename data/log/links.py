@@ -215,12 +215,11 @@ def _to_step(
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
     if steps.body:
-        at = table.set_index(["t", "observer", "neighbour"])
-        both = at.pivot(columns="component", values="value").reindex(columns=[0, 1]).reindex(at.index).to_numpy().T
-        forward, left = during(stacked(members, "velocity"), observer)[:, :2].T
-        vector = both[0] * np.exp(1j * both[1])
-        moved_vector = vector + lag * (forward + 1j * left)
-        less = np.column_stack([np.abs(moved_vector) - both[0], np.angle(moved_vector * vector.conj()), 0.0 * lag])
+        at_once = [table[name] for name in ("t", "observer", "neighbour")]
+        far, aside = (table["value"].where(component == k).groupby(at_once).transform("first") for k in (0, 1))
+        seen = np.array(far * np.exp(1j * aside))
+        there = seen + lag * (during(stacked(members, "velocity"), observer)[:, :2] @ [1, 1j])
+        less = np.column_stack([np.abs(there) - np.abs(seen), np.angle(there * seen.conj()), 0.0 * lag])
         stands = np.array([member.stands for member in members.values()])[neighbour] & np.isnan(change[:, 0])
         change = np.where(stands[:, None], less, change)
         value = np.where(component == 1, value + lag * during(rate, observer), value)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import AnyArray, Floats, Ints, robust_std
+from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
 
 from .estimates import (
@@ -16,6 +16,7 @@ from .estimates import (
     LONG_LAG,
     LONGEST_LAG,
     MOVED_STDS,
+    NUDGE_STEP,
     OUTLYING,
     SURE_ERRORS,
     factors,
@@ -25,7 +26,7 @@ from .estimates import (
 )
 from .frames import UNSTATED
 from .motion import MOVING
-from .residuals import Check, plane, residual_of
+from .residuals import Check, plane, residual_of, without
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE_RATIO, NARROW_RATIO = 2.0, 0.4
@@ -84,20 +85,14 @@ def measurements(c: Check) -> list[dict[str, Any]]:
 
 def of_places(c: Check) -> Iterator[str]:
     """Members that stand elsewhere than their fix says."""
-    at = dict(zip(c.world.ids, plane(np.nan_to_num(c.x)[-1]), strict=True))
-    like = {
-        name: [
-            other
-            for other in at
-            if other != name and abs(at[name] + away - at[other]) < max(3 * error, 0.1 * abs(away))
-        ]
-        for name, (away, error) in c.places.items()
-    }
-    yield from (
-        f"{name}: it stands {away.real:+.2f} m east and {away.imag:+.2f} m north of its fix, +- {error:.2f} m, by what "
-        f"measures it{f': there is {like[name][0]}. Are names exchanged?' if like[name] else '. Correct its place.'}"
-        for name, (away, error) in c.places.items()
-    )
+    ids, at = c.world.ids, plane(np.nan_to_num(c.x)[-1])
+    for name, (away, error) in c.places.items():
+        off = np.abs(at[ids.index(name)] + away - at)
+        like = f": there is {ids[off.argmin()]}. Are names exchanged?"
+        yield (
+            f"{name}: it stands {away.real:+.2f} m east and {away.imag:+.2f} m north of its fix, +- {error:.2f} m, by "
+            f"what measures it{like if off.min() < max(3 * error, 0.1 * abs(away)) else '. Correct its place.'}"
+        )
 
 
 def of_ranges(c: Check) -> Iterator[str]:
@@ -117,49 +112,44 @@ def of_ranges(c: Check) -> Iterator[str]:
 
 def misplaced(c: Check) -> Check:
     """The same with members that stand elsewhere than their fix says, m east + i north and its standard error, and
-    relative measurements less that. The surest is taken off first: beside it, others seem to be off."""
-    links, ids = c.world.links, c.world.ids
-    gap, _ = residual_of(c.world, c.x)
-    flat, up, places = plane(gap), gap[:, 2], dict[str, tuple[complex, float]]()
-    measured = c.relative[:, :2] + np.column_stack([np.hypot(np.abs(flat), up), np.angle(flat)])
-    known = c.expected[:, 0] ** 2 - c.world.sensors.range_std**2
-    lasts = np.nan_to_num(known).clip(0.0) * share(c)  # m^2, errors of filters that last for the drive
-    left = {*np.flatnonzero((np.nan_to_num(c.world.velocity[0]) == 0.0).all(axis=(0, 2))).tolist()}
-
-    def misses(rows: Ints, vector: AnyArray) -> Floats:
-        """(M, 2) m, rad by which ranges and directions miss a vector (M,)."""
-        miss = measured[rows] - np.column_stack([np.hypot(np.abs(vector), up[rows]), np.angle(vector)])
-        return np.column_stack([miss[:, 0], wrap(miss[:, 1])])
-
-    def moved(column: int) -> tuple[float, int, complex, float, Ints, AnyArray]:
-        """How far it is away, in standard errors and as it is, its standard error, its links and vectors to it then."""
-        rows = np.flatnonzero((links.observer == column) | (links.neighbour == column))
-        sign, partner = np.where(links.neighbour[rows] == column, 1.0, -1.0), (links.observer + links.neighbour)[rows]
-        away, error, group = 0j, np.inf, np.column_stack([2 * partner, 2 * partner + 1]).ravel()
-        for _ in range(GAUSS_NEWTON):
-            vector = flat[rows] + away * sign
-            std = c.expected[rows, :2] * np.column_stack([np.ones(len(rows)), far := np.maximum(np.abs(vector), 1.0)])
-            y = (misses(rows, vector) / c.expected[rows, :2]).ravel()
-            unit = ((vector / far * sign)[:, None] * [1.0, 1j] / std).ravel()
-            there = np.isfinite(y)
-            if there.sum() < LEAST_COUNT or not (away or np.median(np.abs(y[there])) > 1.0):
-                return 0.0, column, 0j, np.inf, rows, vector
-            x = np.column_stack([unit.real, unit.imag])[there]
-            value, unsure = factors(y[there], x, 1.0, group[there])
-            away, others = away + complex(*value), len(np.unique(partner))
-            error = float(np.hypot(np.linalg.norm(unsure), (lasts[rows].mean() / others) ** 0.5))
-        return abs(away) / max(error, 1e-12), column, away, error, rows, flat[rows] + away * sign
-
+    without what measures these. The surest is taken first: beside it, others seem to be off."""
+    left, ids = {*np.flatnonzero(c.still).tolist()}, c.world.ids
     while left:
-        ratio, column, away, error, rows, vector = max(map(moved, left), key=lambda one: one[0])
-        if ratio < PLACE_ERRORS or abs(away) < c.world.sensors.range_std:
+        found = {column: _elsewhere(c, column) for column in left}
+        column = max(left, key=lambda one: abs(found[one][0]) / found[one][1])
+        away, error = found[column]
+        if abs(away) < max(PLACE_ERRORS * error, c.world.sensors.range_std):
             break
         left.remove(column)
-        places[ids[column]], flat[rows] = (away, error), vector
-    if not places:
-        return c
-    relative = np.column_stack([misses(np.arange(len(flat)), flat), c.relative[:, 2]])
-    return replace(c, relative=relative, places=places)
+        c = replace(without(c, [column]), places={**c.places, ids[column]: (away, error)})
+    return c
+
+
+def _elsewhere(c: Check, column: int) -> tuple[complex, float]:
+    """How far a member is from where its fix is, m east + i north, by ranges and directions, and its standard error."""
+    links, computed = c.world.links, residual_of(c.world, c.x)[1]
+    of_it = (links.observer == column) | (links.neighbour == column)
+    there = np.isfinite(c.relative[:, :2]) & of_it[:, None]
+    group = (2 * (links.observer + links.neighbour)[:, None] + [0, 1])[there]
+
+    def misses(away: complex) -> Floats:
+        """(K,) standard deviations by which it is measured otherwise, were it that far away."""
+        x = c.x.copy()
+        x[:, column, :2] += [away.real, away.imag]
+        miss = c.relative + residual_of(c.world, x)[1] - computed
+        miss[:, 1] = wrap(miss[:, 1])
+        return np.asarray((miss / c.expected)[:, :2][there])
+
+    away, error = 0j, np.inf
+    if len(group) < LEAST_COUNT or np.median(np.abs(misses(away))) <= 1.0:
+        return away, error
+    for _ in range(GAUSS_NEWTON):
+        y = misses(away)
+        x = np.column_stack([y - misses(away + step) for step in (NUDGE_STEP, NUDGE_STEP * 1j)]) / NUDGE_STEP
+        value, unsure = factors(y, x, 1.0, group)
+        away, error = away + complex(*value), float(np.linalg.norm(unsure))
+    known = np.nan_to_num(c.expected[of_it, 0] ** 2 - c.world.sensors.range_std**2).clip(1e-12)
+    return away, float(np.hypot(error, (known.mean() * share(c) / len(np.unique(group // 2))) ** 0.5))
 
 
 def of_measurements(c: Check) -> Iterator[str]:
@@ -283,15 +273,9 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
         offset, error = median(c.relative[rows, k])
         position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
         error = float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
-        if abs(offset) > max(SURE_ERRORS * np.hypot(error, _unsure_place(c, str(pair))), 0.25 * stated):
+        if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated):
             named.append((str(pair), offset, error))
     return sorted(named, key=lambda row: -abs(row[1]))
-
-
-def _unsure_place(c: Check, pair: str) -> float:
-    """m, standard error of where one of a pair stands, if it is misplaced."""
-    ends = pair.replace(" and ", " to ").split(" to ")
-    return max((error for name, (_, error) in c.places.items() if name in ends), default=0.0)
 
 
 def _other_angle(c: Check) -> str:

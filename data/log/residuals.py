@@ -9,7 +9,7 @@ import pandas as pd
 import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
-from coopoc.arrays import AnyArray, Floats, Ints
+from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
 from coopoc.world.body_frames import in_world
 from coopoc.world.links import spherical, stretches, wrap
@@ -79,6 +79,11 @@ class Check:
         """Whether a velocity is of the fixes, whenever they are."""
         reading = self.world.sensors.velocity_reading
         return reading == "fixes" or self.world.ids[column] in self.log.summary.shown
+
+    @property
+    def still(self) -> Bools:
+        """(N,) who never moves."""
+        return np.asarray((np.nan_to_num(self.world.velocity[0]) == 0.0).all(axis=(0, 2)))
 
     @property
     def fix_noise(self) -> float:
@@ -193,6 +198,13 @@ def filtered(log: Log) -> Check:
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
     return Check(log, span + start, world, track, *stats, none, infinite, np.zeros(vehicles, dtype=np.int64))
+
+
+def without(c: Check, columns: Sequence[int]) -> Check:
+    """The same without relative measurements of these vehicles."""
+    links = c.world.links
+    ends = np.isin(links.observer, columns) | np.isin(links.neighbour, columns)
+    return replace(c, relative=np.where(ends[:, None], np.nan, c.relative))
 
 
 def plane(vectors: Floats) -> AnyArray:

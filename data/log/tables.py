@@ -70,9 +70,8 @@ def read_log_table(
     file = path.name
     frame = read_frame(path, *(columns.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
     frame = _with_whole_stamps(frame, columns)
-    beside = {f"{key}_std": f"{header}_std" for key, header in columns.items() if key in KINDS}
-    columns = {key: header for key, header in beside.items() if header in frame} | dict(columns)
-    frame = named_columns(frame, columns, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
+    beside = {f"{key}_std": f"{name}_std" for key, name in columns.items() if key in KINDS and f"{name}_std" in frame}
+    frame = named_columns(frame, {**beside, **columns}, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame:
         placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
         if not (placed and "vehicle" in frame and frame["vehicle"].is_unique):
