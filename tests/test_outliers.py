@@ -7,8 +7,8 @@ import pytest
 from conftest import among, refused
 
 from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors, observe
-from coopoc.world.faults import episodes
 from coopoc.world.links import to_vector, wrap
+from coopoc.world.sensing import episodes
 from coopoc.world.storage import read_recording, save_recording
 
 S2 = Sensors.paper_scenario2()
