@@ -104,13 +104,12 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
 def headers(path: Path) -> list[str]:
     """Column names of a table; none where the file cannot be read: `read_frame` names the fault."""
     try:
-        if path.suffix.lower() == ".csv":
-            return [name.strip() for name in _first_lines(path)[1]]
-        if path.suffix.lower() == ".jsonl":
-            return [str(name) for name in read_frame(path)]
-        from pyarrow.parquet import read_schema
+        if path.suffix.lower() == ".parquet":
+            from pyarrow.parquet import read_schema
 
-        return [str(name) for name in read_schema(path).names]
+            return [str(name) for name in read_schema(path).names]
+        csv_file = path.suffix.lower() == ".csv"
+        return [str(name).strip() for name in (_first_lines(path)[1] if csv_file else read_frame(path))]
     except Exception:  # of Arrow and csv
         return []
 

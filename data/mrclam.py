@@ -17,7 +17,7 @@ from coopoc.world.links import wrap
 
 from .assemble import PLANE_STD, backward_difference, check_size, check_time, interpolate, planar_recording
 from .log.frames import RATE_BIAS_STD, SCALE_STD
-from .log.heading import Signal, step_means
+from .log.heading import Signal, between, step_means
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
@@ -171,11 +171,12 @@ def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
         InputError: a folder without positions of landmarks.
     """
     robots, marks = log.fleet.ids, surveyed(log)
-    wheel, turning = (_delayed(log, values, calibration.lag) for values in (log.speed, log.turn_rate))
+    t = log.fleet.t
+    wheel, turning = (between(Signal(t, each), t - calibration.lag) for each in (log.speed, log.turn_rate))
     forward = _driven(calibration.speed, calibration.slip, wheel, turning)
     return planar_recording(
         (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
-        log.fleet.t,
+        t,
         forward[..., None] * [1.0, 0.0],
         calibration.turn * turning,
         marks[:, 1:],
@@ -209,24 +210,25 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
 
     Source: the variance of batch means, Conway, Some tactical problems in digital simulation, Man. Sci. 10(1), 1963.
     """
-    dt = log.fleet.dt
+    t, dt = log.fleet.t, log.fleet.dt
     first, window = slice(1, int(until / dt)), int(ERROR_SECONDS / dt)
-    if not 10 * ERROR_SECONDS <= until < log.fleet.t[-1]:
+    if not 10 * ERROR_SECONDS <= until < t[-1]:
         raise InputError(
             "calibrate_s",
             f"{until:g} s",
-            f"must be {10 * ERROR_SECONDS:g} s or more and end before the log, {log.fleet.t[-1]:g} s",
+            f"must be {10 * ERROR_SECONDS:g} s or more and end before the log, {t[-1]:g} s",
             "Leave a part to score.",
         )
     velocity = turned(log.fleet.velocity, -midway(log.heading))[first]
     rate = np.diff(log.heading, axis=0)[: len(velocity)] / dt
-    lag = min(LAGS, key=lambda lag: np.nanvar(rate - _delayed(log, log.turn_rate, lag)[first]))
-    wheel, turning = (_delayed(log, values, lag)[first] for values in (log.speed, log.turn_rate))
+    logged = Signal(t, log.speed), Signal(t, log.turn_rate)
+    lag = min(LAGS, key=lambda lag: np.nanvar(rate - between(logged[1], t - lag)[first]))
+    wheel, turning = (between(each, t - lag)[first] for each in logged)
     speed, lost = _factors(window, velocity[..., 0], wheel, wheel * np.abs(turning))
     (turn,), slip = _factors(window, rate, turning), -lost / speed
     driven = _driven(speed, slip, wheel, turning)
     ahead, aside, off = velocity[..., 0] - driven, velocity[..., 1], rate - turn * turning
-    t, robot = np.broadcast_arrays(log.fleet.t[first, None][: len(rate)], np.arange(len(log.fleet.ids)))
+    t, robot = np.broadcast_arrays(t[first, None][: len(rate)], np.arange(len(log.fleet.ids)))
     forward, side, yaw = (grouped(e[there := np.isfinite(e)], robot[there], t[there]) for e in (ahead, aside, off))
     ranges, bearings = _relative(log, until)
     sensors = Sensors(
@@ -248,11 +250,6 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
 def _driven(speed: Floats, slip: Floats, wheel: Floats, turning: Floats) -> Floats:
     """(T, N) m/s, forward speed of what was logged."""
     return np.asarray(speed * wheel * np.maximum(1.0 - slip * np.abs(turning), 0.0))
-
-
-def _delayed(log: MrclamLog, values: Floats, lag: float) -> Floats:
-    """(T, N) as they were `lag` s before, those of the first instant before it."""
-    return np.column_stack([np.interp(log.fleet.t - lag, log.fleet.t, column) for column in values.T])
 
 
 def _factors(window: int, true: Floats, *logged: Floats) -> Floats:

@@ -132,9 +132,9 @@ def _failing(c: Check) -> dict[str, str]:
 
 def _wider(c: Check) -> Check:
     """The same, where fixes err by more than is stated: so do the positions of these vehicles."""
-    nis, links = dict.fromkeys(c.world.ids, 1.0), c.world.links
-    nis.update((row["vehicle"], row["nis"]) for row in c.vehicles if _beyond(row, "nis", OUTLYING))
-    more = np.array([*nis.values()])[np.stack([links.observer, links.neighbour])].mean(axis=0)
+    links, nis = c.world.links, {row["vehicle"]: row["nis"] for row in c.vehicles if _beyond(row, "nis", OUTLYING)}
+    factor = np.array([nis.get(name, 1.0) for name in c.world.ids])
+    more = factor[np.stack([links.observer, links.neighbour])].mean(axis=0)
     noise = np.square(c.world.sensors.relative_std)
     return replace(c, expected=np.sqrt((c.expected**2 - noise) * more[:, None] + noise))
 

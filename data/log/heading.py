@@ -214,6 +214,11 @@ def held(signal: Signal, at: Floats) -> Floats:
     return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], np.nan)
 
 
+def between(signal: Signal, at: Floats) -> Floats:
+    """(G, C) on the straight lines between samples, beyond them the first or last."""
+    return np.column_stack([np.interp(at, signal.t, column) for column in signal.value.T])
+
+
 def integral(signal: Signal, at: Floats) -> Floats:
     """(G, C) integral from the first sample, which holds before it, as the last one does behind it; between two at one
     time the signal leaps."""

@@ -18,6 +18,7 @@ from .heading import (
     Course,
     Reckoning,
     Signal,
+    between,
     heading_at,
     heading_of_rates,
     heading_until,
@@ -301,7 +302,7 @@ def _in_world(
 
         def moving(at: Floats) -> Floats:
             """(G, 3) m/s, NaN where something moves, and no heading is known."""
-            own, angle = _between(speed, at), heading.at(at)
+            own, angle = between(speed, at), heading.at(at)
             stands = np.isnan(angle) & ((np.linalg.norm(own, axis=1) < STANDS) | (heading.at is unknown))
             return np.where(stands[:, None], 0.0, turned(own, angle))
 
@@ -350,17 +351,12 @@ def _heading(
         if (moving := (pace > np.maximum(least, SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
             if len(way.speed.t):
-                course = wrap(course - np.arctan2(*_between(way.speed, t)[:, 1::-1].T))
+                course = wrap(course - np.arctan2(*between(way.speed, t)[:, 1::-1].T))
             bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
             shown_at = t[: len(t) * (rate is None)]
             return Course(courses, source, wanders, np.zeros_like, float(np.median(std)), shown_at, float(bends))
     return Course()
-
-
-def _between(signal: Signal, at: Floats) -> Floats:
-    """(G, C) on the straight lines between samples."""
-    return np.column_stack([np.interp(at, signal.t, column) for column in signal.value.T])
 
 
 def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:
@@ -394,8 +390,8 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     if len(fixes.t) < 2:
         none = np.zeros(len(fixes.t))
         return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), none > 0, 0.0, none)
-    between = np.diff(fixes.t)
-    interval, longest = float(np.median(between)), np.quantile(between, 0.9)
+    apart = np.diff(fixes.t)
+    interval, longest = float(np.median(apart)), np.quantile(apart, 0.9)
     velocity, growth, spread, proved = constant_velocity(
         fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
     )
@@ -457,7 +453,7 @@ def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, s
     ):
         summary.refuse(why, rows[rows["t"].isin(fixes.t[left])].drop_duplicates("t"))
     after = np.minimum(step + 1, len(gnss) - 1)
-    between = np.where((lag > 0) & there[after], after, step)
-    gnss[step] = fixes.value[kept] - lag[:, None] * velocity[between]
+    during = np.where((lag > 0) & there[after], after, step)
+    gnss[step] = fixes.value[kept] - lag[:, None] * velocity[during]
     summary.count("fixes", len(kept))
     return gnss
