@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from ..paths import write
 from ..text import picture
@@ -118,37 +118,15 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
     axes.legend(handles=handles, loc="upper left", handlelength=2.6, bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
 
 
-class _Between(LogLocator):
-    """Ticks between those of a logarithmic axis, evenly spaced where it spans less than a factor of two."""
-
-    def tick_values(self, vmin: float, vmax: float) -> Any:
-        return (
-            super().tick_values(vmin, vmax)
-            if vmax > 2 * vmin
-            else MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(vmin, vmax)
-        )
-
-
 def plain_log(axis: Axis) -> None:
-    """Make an axis logarithmic with plain numbers at 1, 2 and 5 of each decade: at more if it spans less than one, at
-    the decades alone if it spans many."""
-    if axis is axis.axes.xaxis:
-        axis.axes.set_xscale("log")
-    else:
-        axis.axes.set_yscale("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_minor_locator(_Between(subs=(1.2, 1.5, 3.0, 4.0, 7.0), numticks=50))
+    """Make an axis logarithmic with plain numbers at 1, 2 and 5 of each decade, at the decades alone if it spans many;
+    evenly spaced where one of these at most is within."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
 
-    def spans() -> float:
+    def plain(value: float, _: int) -> str:
         low, high = axis.get_view_interval()
-        return float(high / low)
+        return f"{value:g}" if high < 1e3 * low or abs(np.log10(value) % 1.0 - 0.5) > 0.499 else ""
 
-    def decade(value: float, _: int) -> str:
-        whole = abs(np.log10(value) % 1.0 - 0.5) > 0.499
-        return f"{value:g}" if whole or spans() < 1e3 else ""
-
-    def between(value: float, _: int) -> str:
-        return f"{value:g}" if spans() < 5 else ""
-
-    axis.set_major_formatter(FuncFormatter(decade))
-    axis.set_minor_formatter(FuncFormatter(between))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+    axis.set_major_formatter(FuncFormatter(plain))
+    axis.set_minor_locator(NullLocator())
