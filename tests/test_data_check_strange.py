@@ -153,6 +153,20 @@ def test_anchors_elsewhere_are_named_and_no_scale_is(tmp_path, wrong):
     )
 
 
+def test_a_hundred_anchors_are_read_without_a_word(tmp_path):
+    """pandas warned of frames with more than a hundred columns, once for each of them."""
+    rng, t = np.random.default_rng(2), np.arange(0, 40, 0.5)
+    x, places = 10 * np.exp(0.1j * t), 20 * rng.uniform(-1, 1, (2, 110))
+    ranges = np.abs(x[:, None] - places[0] - 1j * places[1]) + rng.normal(0, 0.01, (len(t), 110)) + 0.05
+    table = {"x": x.real, "y": x.imag} | {f"range_m{k}": each for k, each in enumerate(ranges.T)}
+    pd.DataFrame({"t": t, "vehicle": "a", **table}).to_csv(tmp_path / "log.csv", index=False)
+    marks = pd.DataFrame({"vehicle": [f"m{k}" for k in range(110)], "x": places[0], "y": places[1]})
+    marks.to_csv(tmp_path / "places.csv", index=False)
+    log = load_log(str(tmp_path))
+    assert len(log.recording.relative[0]) == 110 * len(t)
+    assert not check(log).places
+
+
 def test_a_receiver_that_loses_its_base_is_named(tmp_path):
     folder = strange(tmp_path / "log", "car", 1)
     log = pd.read_csv(folder / "log.csv")

@@ -78,8 +78,8 @@ def factors(
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
-    k, all_of = x.shape[1], np.column_stack([y, x, x if z is None else z])
-    none = Estimate(np.zeros(k), np.full(k, np.inf))
+    none, seen = Estimate(np.zeros(x.shape[1]), np.full(x.shape[1], np.inf)), np.any(x, axis=0)
+    all_of, k = np.column_stack([y, x[:, seen], (x if z is None else z)[:, seen]]), int(seen.sum())
     if len(y) < MIN_SAMPLES:
         return none
     if groups is not None:
@@ -103,7 +103,8 @@ def factors(
         return none
     count = min(DRIVE_PARTS, max(len(y) // 2, min(len(y), FEW_PARTS)))
     changes = value - np.stack([fitted(every * count // len(y) != part) for part in range(count)])
-    return Estimate(value, np.where(np.any(x, axis=0), lasting(changes), np.inf))
+    none.value[seen], none.error[seen] = value, np.where(np.any(x, axis=0), lasting(changes), np.inf)
+    return none
 
 
 def lasting(parts: Floats) -> Floats:

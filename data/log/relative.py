@@ -127,10 +127,13 @@ def misplaced(c: Check) -> Check:
 
 def _elsewhere(c: Check, column: int) -> tuple[complex, float]:
     """How far a member is from where its fix is, m east + i north, by ranges and directions, and its standard error."""
-    links, computed = c.world.links, residual_of(c.world, c.x)[1]
+    links = c.world.links
     of_it = (links.observer == column) | (links.neighbour == column)
     there = np.isfinite(c.relative[:, :2]) & of_it[:, None]
     group = (2 * (links.observer + links.neighbour)[:, None] + [0, 1])[there]
+    if len(group) < LEAST_COUNT or np.median(np.abs((c.relative / c.expected)[:, :2][there])) <= 1.0:
+        return 0j, np.inf
+    computed = residual_of(c.world, c.x)[1]
 
     def misses(away: complex) -> Floats:
         """(K,) standard deviations by which it is measured otherwise, were it that far away."""
@@ -141,8 +144,6 @@ def _elsewhere(c: Check, column: int) -> tuple[complex, float]:
         return np.asarray((miss / c.expected)[:, :2][there])
 
     away, error = 0j, np.inf
-    if len(group) < LEAST_COUNT or np.median(np.abs(misses(away))) <= 1.0:
-        return away, error
     for _ in range(GAUSS_NEWTON):
         y = misses(away)
         x = np.column_stack([y - misses(away + step) for step in (NUDGE_STEP, NUDGE_STEP * 1j)]) / NUDGE_STEP

@@ -144,10 +144,12 @@ def _wide(
         if column == "std":
             like = f"which belongs to no kind (name it {next(iter(columns))}_std)"
         summary.unused[f"{file}: column {column}{', ' * bool(like)}{like}"] += len(frame)
-    return pd.concat(
-        _cells(frame[filled(frame[name])].assign(kind=kind, **partner), file, name, f"{name}_std")
-        for name, (kind, partner) in columns.items()
-    )
+    parts = []
+    for name, (kind, partner) in columns.items():
+        needed = frame.columns.intersection(["t", "vehicle", "partner", name, f"{name}_std"])
+        cells = frame.loc[filled(frame[name]), needed].assign(kind=kind, **partner)
+        parts.append(_cells(cells, file, name, f"{name}_std"))
+    return pd.concat(parts)
 
 
 def _of_partner(column: str) -> tuple[str, str] | None:
