@@ -72,6 +72,8 @@ def test_a_track_shows_paths_and_truth(seen):
     assert_array_equal(ax.lines[3].get_xydata(), track.x[0, :, 1, :2])
     assert len(ax.patches) == 2 * 3
     assert len(co.plot_track(co.GNSS()(recording, [24])).patches) in (0, 60)
+    crowd = co.plot_track(co.GNSS()(co.observe(fleet, co.Sensors()), range(60)), fleet=fleet)  # names would hide paths
+    assert [text.get_text() for text in crowd.get_legend().texts] == ["truth"]
 
 
 @pytest.mark.parametrize(

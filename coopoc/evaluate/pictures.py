@@ -59,7 +59,7 @@ def plot_recording(recording: Recording, ax: "Axes | None" = None, *, run: int =
 def plot_track(
     track: Track, ax: "Axes | None" = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None
 ) -> "Axes":
-    """Estimated paths of one run with 95 % ellipses, and the truth if a fleet is given.
+    """Estimated paths of one run with 95 % ellipses, named where they are few, and the truth if a fleet is given.
 
     Args:
         track: of any method.
@@ -82,14 +82,14 @@ def plot_track(
     every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
     if fleet is not None:
         same_drive(instance("fleet", fleet, Fleet), (track.ids or fleet.ids)[: len(fleet.ids)], track.t)
-    ax = axes(ax)
+    ax, few = axes(ax), len(track.egos) <= len(COLORS)
     for k, ego in enumerate(track.egos):
         color = COLORS[k % len(COLORS)]
         if fleet is not None:
             label = "truth" if k == 0 else None
             ax.plot(*fleet.position[:, ego, :2].T, color=PALE, lw=4, zorder=1, label=label)
         name = f"vehicle {ego}" if fleet is None else fleet.ids[ego]
-        ax.plot(*track.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=picture(name))
+        ax.plot(*track.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=picture(name) if few else None)
         if track.covariance is not None:
             ellipses(ax, track.x[run, ::every, k, :2], track.covariance[run, ::every, k, :2, :2], color)
     return finish(ax)

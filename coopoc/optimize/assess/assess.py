@@ -76,7 +76,7 @@ class Assessment:
 
 def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = False) -> Assessment:
     """Assessment of a problem at x (n, ambient); without constraints the covariance may be left out, and be `quick`
-    where the exact Hessian alone tells that x is held.
+    where the exact Hessian alone shows that x is held.
 
     >>> from coopoc.optimize import Problem
     >>> vague = Problem(("a",)).add("position", ["a"], [[0, 0, 0]], std=1e8)  # known to 1e8 m is not unknown
