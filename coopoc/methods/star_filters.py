@@ -8,7 +8,6 @@ import numpy as np
 
 from ..arrays import Floats
 from ..kernels.stars.joint_filter import run_filter
-from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
 from ..world.recording import Recording, Vehicles, check_recording
@@ -63,7 +62,7 @@ class JointFilter(Checked):
             recording, noise = with_odometry(recording, recording.observing(egos), noise)
         refine, gates = (wish and noise.exact_relative for wish in (self.exact, self.robust))
         return filter_stars(
-            self, recording, egos, noise, lambda inputs, assumed: run_filter(inputs, assumed, refine, gates)
+            self, recording, egos, noise, lambda inputs, assumed: run_filter(inputs, assumed, refine, gates, False)
         )
 
 
@@ -152,7 +151,10 @@ class LKFSA(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        return filter_stars(self, recording, egos, resolve(self.noise_model, recording), run_lkf_sa)
+        noise = resolve(self.noise_model, recording)
+        return filter_stars(
+            self, recording, egos, noise, lambda inputs, assumed: run_filter(inputs, assumed, False, False, True)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from ..compiling.small import (
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import BACK
-from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
+from ..geometry import Numbers, converted, exact, incomplete, metres, missing, vector, whole
 from .gated import Gates, carry, forget, gate_star, gates_within, go_back, set_ego
 from .messages import (
     BLOCK,
@@ -296,7 +296,9 @@ def move(joint: Joint, n: int) -> None:
 
 
 @as_written
-def run_filter(measurements: Measurements, model: Assumptions, refine: bool, robust: bool) -> Estimates:
+def run_filter(
+    measurements: Measurements, model: Assumptions, refine: bool, robust: bool, laplacian: bool
+) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m.
 
     Args:
@@ -304,6 +306,7 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
         model: noise model.
         refine: one Gauss-Newton step on range and angles.
         robust: gate innovations.
+        laplacian: the relative measurements as LKF-SA takes them.
     """
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
@@ -314,7 +317,7 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
         for t in range(steps):
             star, before = before, star
             n = gather(star, before, measurements, model, first, last, t, old)
-            step(star, joint, gates, model, refine, robust, n, old)
+            step(star, joint, gates, model, refine, robust, laplacian, n, old)
             write(out, joint.state, joint.scratch, first, last, t, measurements.start[t], n)
             old = n
     return out
@@ -335,7 +338,15 @@ def write(out: Estimates, state: Floats, own: Floats, first: int, last: int, t: 
 
 @inner
 def step(
-    star: Star, joint: Joint, gates: Gates, model: Assumptions, refine: bool, robust: bool, n: int, old: int
+    star: Star,
+    joint: Joint,
+    gates: Gates,
+    model: Assumptions,
+    refine: bool,
+    robust: bool,
+    laplacian: bool,
+    n: int,
+    old: int,
 ) -> None:
     """Predict and update the state of n members, `old` of them before; the ego's covariance is then in `scratch`."""
     flat = 1.0 / model.flat
@@ -348,14 +359,20 @@ def step(
         if not back <= 0.0 * back:
             place_ego(joint, back, block_at(gates.state, 0), n)
             begin_anew(star, joint, gates, back - BACK, model.flat, n)
-    place_on_broadcast(star, joint, n)
+    if not laplacian:
+        place_on_broadcast(star, joint, n)
     if robust:
         for k in range(1, n):
             store(joint.move, k, (placed(joint, k, relative_of(star, k)),))
         gate_star(star, gates, joint.state, joint.move, model.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
-    update(star, joint, model, refine, n)
+    if laplacian:
+        add_laplacian(star, joint, model, n)
+        store(joint.scratch, 0, negate(solve(joint.information, joint, joint.eta, n)))
+        move(joint, n)
+    else:
+        update(star, joint, model, refine, n)
     set_ego(gates, block_at(joint.scratch, 0))
 
 
@@ -421,3 +438,42 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
             add_relative(a, eta, joint.stride, k, n, weight, vector)
         store(joint.scratch, 0, negate(solve(a, joint, eta, n)))
     move(joint, n)
+
+
+@inner
+def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
+    """Add L W L and L W (delta - L x), L the Laplacian of the star of complete measurements: W is 1, or the edges'
+    information over the degree; that of an edge is the inverse mean variance per axis of the converted vectors."""
+    o, std, stride, e = 0.0 * vector_at(joint.state, 0)[0], model.relative_std, joint.stride, n - 1
+    count, total, gaps = o, o, (o, o, o)
+    for k in range(1, n):
+        edge, gap = edge_to(star, joint, k)
+        count, gaps = count + edge, add(gaps, gap)
+        if len(std):
+            a, b, c = metres(relative_of(star, k), std, model.min_range)
+            total = total + edge * (a * a + b * b + c * c)
+    outer = central = o + 1.0
+    if len(std):
+        outer = choose(count, 3.0 * count / max(total, o + 1e-300), outer)
+        central = outer / max(count, o + 1.0)
+    for k in range(1, n):
+        edge, gap = edge_to(star, joint, k)
+        weight = add_diagonal(zeros(o, BLOCK), (outer * edge, outer * edge, outer * edge))
+        add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer))
+    for i in range(n):
+        row = count if i == e else -edge_to(star, joint, i + 1)[0]
+        store(joint.eta, i, subtract(vector_at(joint.eta, i), scale(gaps, row * central)))
+        for j in range(i, n):
+            other = count if j == e else -edge_to(star, joint, j + 1)[0]
+            at, number = i * stride + j, central * row * other
+            block = add_diagonal(block_at(joint.information, at), (number, number, number))
+            store(joint.information, at, block)
+
+
+@inside
+def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
+    """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
+    polar = relative_of(star, k)
+    edge = whole(polar)
+    gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
+    return edge, scale(gap, edge)
