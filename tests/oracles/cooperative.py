@@ -665,7 +665,6 @@ class Oracle:
             self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
-                s.agreed = s.agreed if s.jumped else 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0 if supported else 1.0
