@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import XAxis, YAxis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
@@ -118,7 +118,7 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
     axes.legend(handles=handles, loc="upper left", handlelength=2.6, bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
 
 
-def plain_log(axis: Axis) -> None:
+def plain_log(axis: XAxis | YAxis) -> None:
     """Make an axis logarithmic with plain numbers at 1, 2 and 5 of each decade, at the decades alone if it spans many;
     evenly spaced where one of these at most is within."""
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})

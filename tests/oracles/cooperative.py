@@ -657,7 +657,7 @@ class Oracle:
         judged = j != self.ego or any(i in s.last for i in s.members)
         doubtful = g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows))
         if doubtful:
-            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= 0
+            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= -0.5 * FIX_GATE
             if supported and j in s.trusted:
                 s.revoked[j] = s.revoked.get(j, 0) + 1
             elif not supported:
