@@ -28,7 +28,8 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     are more than text.
 
     Raises:
-        InputError: an option without a value, twice, or with a value of another kind, a data set that is to be fetched.
+        InputError: an option without a value, or twice without pairs that add up, or with a value of another kind, a
+            data set that is to be fetched.
 
     >>> split("drive.csv?dt=0.1&columns=t:time,id:car")
     ('drive.csv', {'dt': 0.1, 'columns': {'t': 'time', 'id': 'car'}})
@@ -41,10 +42,10 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     name = name if os.path.exists(name) else str(local(name) or name)
     if not mark:
         return name, {}
-    options = {}
+    options: dict[str, Any] = {}
     for part in query.split("&"):
         key, equals, value = part.partition("=")
-        if not (key and equals and value) or key in options:
+        if not (key and equals and value) or not isinstance(options.get(key, {}), dict):
             raise InputError(
                 "data",
                 repr(text),
@@ -53,7 +54,7 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
             )
         read, allowed, example = READ.get(key, (str, "", ""))
         try:
-            options[key] = read(value)
+            options[key] = options[key] | read(value) if key in options else read(value)
         except ValueError:
             raise InputError(
                 key,

@@ -103,6 +103,13 @@ def noisy(rng: np.random.Generator, t: Any, name: str, columns: dict[str, tuple[
     )
 
 
+def star(t: Any, rng: Any, name: str, ways: Any, velocity: Any, seen: Any, std: float = 1.3) -> pd.DataFrame:
+    """Velocities, fixes and ranges to all others of one of those on complex `ways`, in a wide table."""
+    columns = {"vx": (velocity.real, 0.1), "vy": (velocity.imag, 0.1), "x": (seen.real, std), "y": (seen.imag, std)}
+    reach = {f"range_{other}": (abs(way - ways[name]), 0.2) for other, way in ways.items() if other != name}
+    return noisy(rng, t, name, columns | reach)
+
+
 def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
     """Vehicles on bends through all directions at 8 m/s, 12 m apart; `climb` m of height that come and go."""
     t = 0.02 * np.arange(int(minutes * 3000))

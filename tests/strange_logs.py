@@ -24,13 +24,13 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         seconds: of the drive.
         rate: factor of all rates.
         fault: `pairs` (a, b) -> m, `clocks` s and `wheels` (share of the speed) of vehicles, `late` fixes s, `unit` of
-            ranges, `tunnel` (from, to) s without fixes, `stated` factor of the deviations of fixes.
+            ranges, `tunnel` (from, to) s without fixes, `body` where drones log velocities in theirs.
     """
     count, pace, apart, climb, fix, reach, rates = KINDS[kind]
     rng, noise, t = np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.02 * np.arange(int(seconds * 50))
     drones, cars, robots = (kind == name for name in KINDS)
     names, axes = [f"{kind}{k}" for k in range(count)], list("xyz" if drones else "xy")
-    begin, end = fault.get("tunnel", (-1, -1))
+    (begin, end), body = fault.get("tunnel", (-1, -1)), "body" in fault
     place, speed, course, tables = {}, {}, {}, []
     shape = rng.uniform(0.6, 1.4, (count, 3))
     for k, name in enumerate(names):
@@ -45,9 +45,9 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
     def at(values, times):
         return np.column_stack([np.interp(times, t, axis) for axis in np.atleast_2d(values.T)])
 
-    def add(name, times, kinds, values, std, stated=1.0, **more):
+    def add(name, times, kinds, values, std, **more):
         values = values + noise.normal(0, std, values.shape)
-        columns = dict(zip(kinds, values.T, strict=True)) | {f"{one}_std": stated * std for one in kinds}
+        columns = dict(zip(kinds, values.T, strict=True)) | {f"{one}_std": std for one in kinds}
         now = times + fault.get("clocks", {}).get(name, 0.0)
         frame = pd.DataFrame({"t": now, "vehicle": name, **columns, **more})
         tables.append(frame[frame[kinds[0]].gt(0) | (kinds[0] != "range")])
@@ -58,13 +58,16 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         scale, late = 1 + fault.get("wheels", {}).get(name, 0.0), fault.get("late", 0.0)
         if not robots:
             fixes = at(place[name], fixed)[:, : len(axes)]
-            add(name, fixed + late, axes, fixes, fix, fault.get("stated", 1.0))
+            add(name, fixed + late, axes, fixes, fix)
         if drones:
             u = (at(place[name], moved + 0.05) - at(place[name], moved - 0.05)) / 0.1
-            add(name, moved, ["vx", "vy", "vz"], scale * u, 0.1)
+            along = (u @ [1, 1j, 0]) * np.exp(-1j * body * at(course[name], moved)[:, 0])
+            u, end_of = np.c_[along.real, along.imag, u[:, 2]], "_body" * body
+            add(name, moved, [f"{one}{end_of}" for one in ("vx", "vy", "vz")], scale * u, 0.1)
         else:
-            turn = (at(course[name], moved + 0.05) - at(course[name], moved - 0.05)) / 0.1
             add(name, moved, ["speed"], scale * at(speed[name], moved), 0.02 if robots else 0.1)
+        if body or not drones:
+            turn = (at(course[name], moved + 0.05) - at(course[name], moved - 0.05)) / 0.1
             add(name, moved, ["yaw_rate"], turn, 0.01)
         if cars:
             add(name, moved, ["heading"], at(course[name], moved), 0.01)

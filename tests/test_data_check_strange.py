@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from logs import noisy
+from logs import noisy, star
 from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.check import check
+from coopoc.data.log.residuals import begin_of
 from coopoc.data.registry import read_log as load_log
 
 PAIRS = {("drone0", "drone1"): 0.45, ("drone1", "drone3"): -0.25, ("drone0", "drone2"): 0.6}
@@ -62,16 +63,28 @@ def test_millimetres_and_wheels_of_robots_are_named(tmp_path):
     assert "ranges" not in text
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_filter_is_near_one_that_knows_the_faults(tmp_path, seed):
-    """The reference: the same filter on the same drive without what was planted, the tunnel but."""
-    told = "clock=drone1:0.3,drone3:-0.12&offset=drone0-drone1:0.45,drone1-drone3:-0.25,drone0-drone2:0.6"
-    for kind, fault, options in (("car", CONVOY, ""), ("drone", DRONES, f"?{told}")):
-        errors = []
-        for name, planted, more in (("a", fault, options), ("b", {"tunnel": fault.get("tunnel", (-1, -1))}, "")):
-            log = load_log(f"{strange(tmp_path / (kind + name), kind, seed, **planted)}{more}")
-            errors.append(float(co.rt_le(co.CooperativeFilter()(log.recording, log.recording.ids), log.truth).mean()))
-        assert errors[0] < 1.3 * errors[1]
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("kind", "fault", "taken"),
+    [
+        ("car", CONVOY, ""),
+        ("drone", DRONES, "clock|offset"),
+        ("drone", {"pairs": PAIRS, "body": True}, ""),
+        ("robot", ROBOTS, "scale"),
+    ],
+)
+def test_the_filter_is_near_one_that_knows_the_faults(tmp_path, kind, fault, taken, seed):
+    """The reference: the same filter on the same drive without what was planted, the tunnel but; the filter takes what
+    the check prints of some options."""
+    errors, frame = list[Any](), "frame=body" if kind == "robot" or "body" in fault else "frame=world"
+    for planted in (fault, {key: fault[key] for key in fault if key in ("tunnel", "body")}):
+        folder = strange(tmp_path / str(len(errors)), kind, seed, **planted)
+        printed = re.findall(rf"(?:{taken})=\S*\d", said(folder, frame)) if taken and not errors else []
+        log = load_log(f"{folder}?{'&'.join([frame, *printed])}")
+        begin, spread, _ = begin_of(log) if log.recording.body else (None, None, "")
+        method = co.PoseFilter(begin=begin, spread=spread) if log.recording.body else co.CooperativeFilter()
+        errors.append(co.rt_le(method(log.recording, log.recording.vehicles), log.truth).mean())
+    assert errors[0] < 1.3 * errors[1]
 
 
 def test_wheels_that_spin_lead_no_smoother_astray(tmp_path):
@@ -118,7 +131,7 @@ OF_RANGES: dict[str, Any] = {
 def test_what_ranges_share_is_named_and_no_offset_is(tmp_path, words, truth):
     folder = strange(tmp_path / "log", "drone")
     log = pd.read_csv(folder / "log.csv")
-    log.assign(**OF_RANGES[words](log)).to_csv(folder / "log.csv", index=False)
+    log.assign(**OF_RANGES[words](log)).to_csv(folder / "log.csv")
     if not truth:
         (folder / "truth.csv").unlink()
     text = said(folder)
@@ -146,7 +159,7 @@ def test_anchors_elsewhere_are_named_and_no_scale_is(tmp_path, wrong):
     places = PLACES.copy()
     places.loc[[1] * wrong, ["x", "y"]] += [-1.5, 0.96]
     for frames, name in ((tables, "log"), (truth, "truth"), ([places], "places")):
-        pd.concat(frames).to_csv(tmp_path / f"{name}.csv", index=False)
+        pd.concat(frames).to_csv(tmp_path / f"{name}.csv")
     text = said(tmp_path)
     assert re.fullmatch(
         r"b: it stands \+1\.[45]\d m east and -0\.9\d m north of its fix.*Correct its place\." * wrong, text
@@ -159,9 +172,9 @@ def test_a_hundred_anchors_are_read_without_a_word(tmp_path):
     x, places = 10 * np.exp(0.1j * t), 20 * rng.uniform(-1, 1, (2, 110))
     ranges = np.abs(x[:, None] - places[0] - 1j * places[1]) + rng.normal(0, 0.01, (len(t), 110)) + 0.05
     table = {"x": x.real, "y": x.imag} | {f"range_m{k}": each for k, each in enumerate(ranges.T)}
-    pd.DataFrame({"t": t, "vehicle": "a", **table}).to_csv(tmp_path / "log.csv", index=False)
+    pd.DataFrame({"t": t, "vehicle": "a", **table}).to_csv(tmp_path / "log.csv")
     marks = pd.DataFrame({"vehicle": [f"m{k}" for k in range(110)], "x": places[0], "y": places[1]})
-    marks.to_csv(tmp_path / "places.csv", index=False)
+    marks.to_csv(tmp_path / "places.csv")
     log = load_log(str(tmp_path))
     assert len(log.recording.relative[0]) == 110 * len(t)
     assert not check(log).places
@@ -172,7 +185,7 @@ def test_a_receiver_that_loses_its_base_is_named(tmp_path):
     log = pd.read_csv(folder / "log.csv")
     part = (log["vehicle"] == "car1") & log["t"].between(60, 100)
     noise = np.random.default_rng(0).normal(0, 10, (2, len(log))) * part.to_numpy()
-    log.assign(x=log["x"] + noise[0], y=log["y"] + noise[1]).to_csv(folder / "log.csv", index=False)
+    log.assign(x=log["x"] + noise[0], y=log["y"] + noise[1]).to_csv(folder / "log.csv")
     assert "car1: its fixes scatter by" in said(folder)
 
 
@@ -185,19 +198,10 @@ def test_odometry_of_one_that_errs_is_no_clock_of_others(tmp_path, pace, factor,
     u = pace * (1 + 0.25 * np.sin(0.08 * t + k)) * np.exp(1.2j * np.sin(0.07 * t + 0.3 * k))
     x = 0.2 * np.cumsum(u, axis=1) - 0.1 * u + 9j * k
     u[1] *= factor
-    tables = list[pd.DataFrame]()
-    for own, name in enumerate("abcd"):
-        columns = {
-            "vx": (u[own].real, 0.05),
-            "vy": (u[own].imag, 0.05),
-            "x": (x[own].real, 1.2),
-            "y": (x[own].imag, 1.2),
-        }
-        columns |= {
-            f"range_{other}": (abs(at - x[own]), 0.1) for other, at in zip("abcd", x, strict=True) if other != name
-        }
-        tables.append(noisy(rng, t, name, columns))
-    pd.concat(tables).to_csv(tmp_path / "log.csv", index=False)
+    ways = dict(zip("abcd", x, strict=True))
+    pd.concat([star(t, rng, name, ways, own, ways[name]) for name, own in zip("abcd", u, strict=True)]).to_csv(
+        tmp_path / "log.csv"
+    )
     text = said(tmp_path)
     assert re.findall(rf"(\w): its odometry is {words}", text) == ["b"]
     assert text.count("its odometry") == 1
@@ -242,10 +246,7 @@ def test_errors_that_last_are_no_fault_and_small_lags_are(tmp_path, fault, words
         late = 0.3 * (name == "b" and not wanders)
         noise = 0.22 * wanders * rng.normal(size=(2, len(t) + 199))
         east, north = (np.convolve(each, memory, "valid") for each in noise)
-        seen = way - late * u * (fault == "fixes are late")
-        table = {"vx": (u.real, 0.1), "vy": (u.imag, 0.1)}
-        table |= {"x": (seen.real + east, 1.3), "y": (seen.imag + north, 1.3)}
-        table |= {f"range_{other}": (abs(x[other] - way), 0.3) for other in x if other > name}
-        tables.append(noisy(rng, t + late * (fault == "a clock"), name, table))
-    pd.concat(tables).to_csv(tmp_path / "log.csv", index=False)
+        seen = way - late * u * (fault == "fixes are late") + east + 1j * north
+        tables.append(star(t + late * (fault == "a clock"), rng, name, x, u, seen))
+    pd.concat(tables).to_csv(tmp_path / "log.csv")
     assert re.match(words, said(tmp_path), re.DOTALL)

@@ -55,7 +55,9 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
     """States (T, n, d) and covariances (T, n, d, d) of one run in one state, any numbers for members that are away."""
     (steps, members), odometer = drive.active.shape, noise.odometer
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
-    x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
+    extra, lasting = drive.ends[:, 2].max() // d + 1, np.array(noise.lasting)[: d - 4]  # 0 and offsets of pairs
+    x = np.zeros((members + extra, d))
+    P = np.diag(np.repeat([0.0, 0.3**2 * noise.lasting[2]], [members * d + 1, extra * d - 1]))
     pace = np.zeros((members, 3))
     keep = np.array([noise.keep] * 2 + [1] + [noise.keep] * 3)[: d - 4]  # an offset stays
     grown = (lasting * (1 - keep**2)).tolist()
@@ -83,7 +85,8 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
                 given = np.isfinite(begin[0][n])
                 x[n, :4][given], wide[:4][given] = begin[0][n][given], np.square(begin[1])[given]
             Q.append(np.diag(wide))
-        P = block_diag(*F) @ P @ block_diag(*F).T + block_diag(*Q)
+        F, Q = block_diag(*F, np.eye(extra * d)), block_diag(*Q, np.zeros((extra * d,) * 2))
+        P = F @ P @ F.T + Q
         flat = x.ravel()
         for n in np.flatnonzero(drive.active[t]):
             own, b = drive.own[run, t, n], d * n
@@ -96,8 +99,8 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
         links = [k for k in links if located[drive.ends[k, 0]] and (drive.ends[k, 1] < 0 or located[drive.ends[k, 1]])]
         if len(links):
             flat, P = relative(flat, P, drive, noise, (run, links, d), passes)
-        x = flat.reshape(members, d).copy()
-        out[t], covs[t] = x, P.reshape(members, d, members, d)[np.arange(members), :, np.arange(members)]
+        x = flat.reshape(-1, d).copy()
+        out[t], covs[t] = x[:members], P.reshape(*x.shape, *x.shape)[np.arange(members), :, np.arange(members)]
     return out, covs
 
 
@@ -113,7 +116,8 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
         predicted = []
         for k in links:
             mine, other = ends(s, k)
-            longer = np.array([mine[6], 0, 0]) if d > 6 else 0
+            pair = s[d * drive.own.shape[2] + drive.ends[k, 2]]
+            longer = np.array([mine[6] + pair, 0, 0]) if d > 6 else 0
             predicted.append((spherical(mine, other) + longer)[np.isfinite(drive.relative[run, k])])
         return np.concatenate(predicted)
 

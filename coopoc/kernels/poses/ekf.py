@@ -27,6 +27,8 @@ JOINT, NAIVE, INTERSECTION = range(3)
 """How estimates are fused: in one state, as if their errors were independent, by covariance intersection."""
 WEIGHTS_TRIED = 10
 """Weights that covariance intersection tries."""
+OF_PAIRS = 0.3
+"""What the ranges of a pair are too long by, over what those of an observer are."""
 
 
 class PoseMeasurements(NamedTuple):
@@ -35,7 +37,7 @@ class PoseMeasurements(NamedTuple):
     Attributes:
         own: (R, T, n, 8) fix m, compass rad, NaN where missing, velocity m/s forward, left and up, yaw rate rad/s.
         active: (T, n) whether a member is there.
-        ends: (L, 2) numbers of observer and other, -1 for a landmark.
+        ends: (L, 3) numbers of observer and other, -1 for a landmark, and of the pair, 0 where its offset is no state.
         first: (T+1,) first relative measurement of each step.
         landmark: (L, 3) m, its position.
         relative: (R, L, 3) m, rad from the observer's heading, rad; NaN where missing.
@@ -120,6 +122,9 @@ def step(
     d = options.d
     if t == 0:
         poses.totals[COST] = poses.totals[USED] = 0.0
+        poses.x[:], poses.cov[:] = 0.0, 0.0
+        for i in range(d * measured.own.shape[2] + 1, len(poses.x)):
+            poses.cov[i, i] = OF_PAIRS * OF_PAIRS * noise.lasting[2]
     for k in range(measured.own.shape[2]):
         own, member = measured.own[run, t, k], d * k
         if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
@@ -176,7 +181,8 @@ def update_jointly(
         if again:
             poses.x[:], poses.cov[:], poses.totals[COST] = poses.prior_x, poses.prior_cov, cost
         for k in range(begin, end):
-            ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
+            i, j, pair = measured.ends[k]
+            ends = (d * i, d * j, d * measured.own.shape[2] + pair)
             landmark, relative, bits = measured.landmark[k], measured.relative[run, k], left_out[k - begin]
             bits = update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, bits)
             left_out[k - begin] = bits
@@ -209,7 +215,7 @@ def fuse_pair(
         IROS 2013.
     """
     d, observer, other = options.d, options.d * measured.ends[k, 0], options.d * measured.ends[k, 1]
-    ends = (ZERO, d if other >= 0 else ALONE)
+    ends = (ZERO, d if other >= 0 else ALONE, 2 * d)
     tries = WEIGHTS_TRIED if options.fusion == INTERSECTION and other >= 0 else 0
     best, chosen = math.inf, 1.0
     for attempt in range(tries + 1):

@@ -2,8 +2,9 @@
 
 The state of a member is d = 4, 6, 7 or 10 numbers: position m, heading rad and, of six, the odometer's scale error and
 the yaw rate's bias rad/s, of seven also what its ranges are too long by, m, of ten also the slow error of its velocity,
-m/s. A row is linear in the pose of one member and that offset, (a, b, c, h, o), and at most in the position of another,
-(-a, -b, -c): every measurement here is one of the vector between the two and of the first one's heading.
+m/s. Behind all members stand 0 and what the ranges of pairs are too long by beside that, m. A row is linear in the pose
+of one member and those offsets, (a, b, c, h, o), and at most in the position of another, (-a, -b, -c): every
+measurement here is one of the vector between the two and of the first one's heading.
 """
 
 import math
@@ -28,8 +29,8 @@ ROWS = 4
 """Rows that may be pending, so that one pass over the covariance serves them all."""
 MIN_ANGLE_DISTANCE = 1e-3
 """m, least distance at which an angle is linearised."""
-Ends = tuple[int, int]
-"""First number of the member and of the other, -1 for none."""
+Ends = tuple[int, int, int]
+"""First number of the member and of the other, number of the offset of the pair, where ranges have one."""
 ALONE: Any = np.int64(-1)
 ZERO: Any = np.int64(0)
 """Numbers of the type of a variable: a literal would compile a function of ends once more."""
@@ -38,7 +39,7 @@ Three = tuple[float, float, float]
 
 
 class Poses(NamedTuple):
-    """State of n members of d numbers each, filled up with zeros to a multiple of LANES, and memory of an update.
+    """State of n members of d numbers each and of pairs, filled up to a multiple of LANES, and memory of an update.
 
     Attributes:
         x: (size,).
@@ -99,7 +100,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     """
     if poses.totals[PENDING] == ROWS:
         apply_pending_rows(poses)
-    cov, columns, pending, (k, o), (a, b, c, h, e) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
+    cov, columns, pending, (k, o, p), (a, b, c, h, e) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
     tiles = len(poses.x) // LANES
     for tile in range(tiles):
         x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
@@ -109,6 +110,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
         total = plus(plus(plus(h * entries(cov, k + HEADING, tile, tiles), a, x), b, y), c, z)
         if e != 0.0:
             total = plus(total, e, entries(cov, k + OFFSET, tile, tiles))
+            total = plus(total, e, entries(cov, p, tile, tiles))
         put(columns, uint64(pending * tiles + tile), total)
     for q in range(pending):
         share = along(columns[q], ends, row) * poses.weights[q]
@@ -143,10 +145,10 @@ def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
 @part
 def along(column: Floats, ends: Ends, row: Row) -> float:
     """h^T v of a row and a column."""
-    (k, o), (a, b, c, h, e) = ends, row
+    (k, o, p), (a, b, c, h, e) = ends, row
     total = a * column[k] + b * column[k + 1] + c * column[k + 2] + h * column[k + HEADING]
     if e != 0.0:
-        total += e * column[k + OFFSET]
+        total += e * (column[k + OFFSET] + column[p])
     if o >= 0:
         total -= a * column[o] + b * column[o + 1] + c * column[o + 2]
     return float(total)
@@ -184,7 +186,7 @@ def wrapped(angle: float) -> float:
 def update_heading(poses: Poses, member: int, heading: float, variance: float, gate: float) -> None:
     """A compass heading rad."""
     residual = wrapped(heading - poses.x[member + HEADING])
-    update_row(poses, (member, ALONE), (0.0, 0.0, 0.0, 1.0, 0.0), residual, variance, gate)
+    update_row(poses, (member, ALONE, ALONE), (0.0, 0.0, 0.0, 1.0, 0.0), residual, variance, gate)
 
 
 @part
@@ -199,7 +201,7 @@ def update_fix(poses: Poses, member: int, fix: Floats, variance: Three, gate: fl
         share, hits[m] = gate_fix(gap, own, variance, FIX_GATE / GATE * gate, hits[m])
     for axis in range(3 if math.isfinite(share) else 0):
         row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0)
-        update_row(poses, (member, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
+        update_row(poses, (member, ALONE, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
 
 
 @part
@@ -238,7 +240,7 @@ def update_relative(
 
     Args:
         poses: the state.
-        ends: observer, and the other or -1 for a landmark.
+        ends: observer, the other or -1 for a landmark, and the pair.
         landmark: of the landmark, m.
         measured: m, rad, rad, NaN where missing.
         variances: of the three.
@@ -249,7 +251,7 @@ def update_relative(
     Returns:
         The bits, and those of the components that are rejected.
     """
-    (k, o), linear = ends, poses.linear
+    (k, o, p), linear = ends, poses.linear
     position = landmark if o < 0 else linear[o : o + 3]
     polar = direction((position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2]))
     curved = curvature(poses.prior_cov, ends, polar)
@@ -259,7 +261,7 @@ def update_relative(
         residual, row = relative_row(polar, linear[k + HEADING], component, measured[component], longer)
         residual -= along(poses.x, ends, row) - along(linear, ends, row)
         if row[HEADING + 1] != 0.0:
-            residual -= linear[k + OFFSET]
+            residual -= linear[k + OFFSET] + linear[p]
         if not update_row(poses, ends, row, residual, variances[component] + curved[component], gate):
             left_out |= 1 << component
     return left_out
@@ -284,7 +286,7 @@ def curvature(cov: Floats, ends: Ends, polar: Numbers) -> Three:
 @part
 def gap_cov(cov: Floats, ends: Ends, a: Numbers, b: Numbers) -> float:
     """Covariance m^2, along two directions, of the vector from a member to another or to a landmark."""
-    (k, o), row, total = ends, (b[0], b[1], b[2], 0.0, 0.0), 0.0
+    (k, o, _), row, total = ends, (b[0], b[1], b[2], 0.0, 0.0), 0.0
     for i in range(3):
         total += a[i] * along(cov[k + i], ends, row)
         if o >= 0:

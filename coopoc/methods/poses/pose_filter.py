@@ -61,8 +61,9 @@ class PoseFilter:
         fusion: of a fleet. "joint": one state with all cross-covariances, at a centre, the optimum. Decentralised, each
             vehicle fuses the estimates that reach it in time: "naive" as if their errors were independent;
             "intersection" by covariance intersection.
-        lasting: estimate the odometer's scale error, the yaw rate's bias and, if assumed, an offset of ranges and a
-            slow error of the velocity, too (`Track.extras`); None where the noise has any of them, as that of a log.
+        lasting: estimate the odometer's scale error, the yaw rate's bias and, if assumed, an offset of ranges, in a
+            joint state also of each pair whose ends have fixes, and a slow error of the velocity, too
+            (`Track.extras`); None where the noise has any of them, as that of a log.
         exact: False is the plain extended Kalman filter.
         robust: a component beyond its gate weighs less, far beyond it nothing, unless many are
             (`coopoc.kernels.gate`); False believes every number.
@@ -260,7 +261,8 @@ class PoseFilter:
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
         noise, options = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
-        poses, pair = new_poses(len(members) * options.d), new_poses(2 * options.d)
+        pairs = 1 + int(measured.ends[:, 2].max(initial=0))
+        poses, pair = new_poses(len(members) * options.d + pairs), new_poses(2 * options.d + 1)
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         faults = new_faults(len(members), noise, recording.dt)
         return run_filter(measured, noise, first, spread, options, poses, pair, faults)

@@ -26,6 +26,8 @@ SPREAD = (0.5, 0.5, 0.5, 0.15)
 those of `pose_start` err by less."""
 LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
+MOST_PAIRS = 200
+"""Pairs whose offset of ranges is a state."""
 
 
 def body_of(recording: Recording) -> Body:
@@ -130,11 +132,15 @@ def pose_measurements(
     body, table, number = body_of(recording), recording.links, np.full(len(recording.ids), -1)
     number[list(members)] = np.arange(len(members))
     own = [recording.gnss, body.heading[..., None], recording.velocity, body.yaw_rate[..., None]]
-    relative = recording.relative[:, links]
+    relative, ends = recording.relative[:, links], number[[table.observer[links], table.neighbour[links]]]
+    low, high = np.sort(ends, axis=0)
+    pair = high * (high - 1) // 2 + low + 1
+    fixed: Bools = np.isfinite(recording.gnss[:, :, members, 0]).any(axis=(0, 1))  # fixes of both show it
+    pair *= fixed[ends].all(axis=0) & (low >= 0) & (pair <= MOST_PAIRS)
     return PoseMeasurements(
         np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], axis=3)),
         np.ascontiguousarray(present(recording)[:, members]),
-        np.stack([number[table.observer[links]], number[table.neighbour[links]]], axis=1),
+        np.column_stack([*ends, pair]),
         np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),
         recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark,
         np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),

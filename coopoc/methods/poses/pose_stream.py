@@ -100,7 +100,7 @@ class PoseStream:
 
         self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
         self._begin, self._later, self._heading = begin[None, None, None], False, np.nan
-        self._poses, self._pair = (new_poses(count * options.d) for count in (1, 2))
+        self._poses, self._pair = (new_poses(count * options.d + 1) for count in (1, 2))
         self._faults = new_faults(1, noise, dt)
 
     def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
@@ -127,7 +127,7 @@ class PoseStream:
         t, count = int(self._later), len(marks)
         positions = np.array([mark.position for mark in marks], dtype=float).reshape(-1, 3)
         relative = np.array([mark.relative for mark in marks], dtype=float).reshape(1, -1, 3)
-        both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1], (count, 1))
+        both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1, 0], (count, 1))
         first = np.array([0, 0, count] if t else [0, count, count])
         active = np.ones((2, 1), dtype=bool)
         measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt)
