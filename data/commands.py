@@ -131,9 +131,4 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     print(f"picture: {out}", file=sys.stderr)
 
 
-COMMANDS = {
-    "list": list_,
-    "get": get,
-    "show": show,
-    "check": check,
-}
+COMMANDS = {"list": list_, "get": get, "show": show, "check": check}

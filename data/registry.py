@@ -72,10 +72,6 @@ DATASETS = {  # written out: `coopoc list` reads the names without an import
 """Bundled fleets; the names are written out so that a list of them imports nothing."""
 
 
-def _mrclam_fleet(path: Path, *, dt: float = 0.1, max_gap: float = MAX_GAP) -> Fleet:
-    return read_mrclam(path, dt=dt, max_gap=max_gap).fleet
-
-
 def _stored_log(path: Path) -> Log:
     recording, truth = read_recording(path)
     vehicles, grid = dict.fromkeys(recording.ids, "recorded"), f"{steps_in_words(recording)}, {recording.runs} runs"
@@ -90,17 +86,13 @@ def _graph_log(path: Path, **options: Any) -> Log:
     return replace(log, recording=replace(log.recording, sensors=whole))
 
 
-LOGS: Mapping[str, Callable[..., Log]] = {
-    "pyfg": _graph_log,
-    "recording": _stored_log,
-    "log": logs.read_log,
-}
+LOGS: Mapping[str, Callable[..., Log]] = {"pyfg": _graph_log, "recording": _stored_log, "log": logs.read_log}
 """Formats of real measurements -> reader; one of several files or endings belongs to `log.read.READERS`."""
 DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "table": read_table,
     "tum": read_tum,
     "fcd": read_fcd,
-    "mrclam": _mrclam_fleet,
+    "mrclam": lambda path, dt=0.1, max_gap=MAX_GAP: read_mrclam(path, dt=dt, max_gap=max_gap).fleet,
 }
 """Formats of drives -> reader; of MR.CLAM Vicon's truth, whose measurements `coopoc run real` takes."""
 MEASURED = {".npz": "recording", ".pyfg": "pyfg"}

@@ -11,6 +11,7 @@ import pytest
 from conftest import refused
 from logs import bends, drive, fixes, motion, noisy, outliers, ranges, write
 from numpy.testing import assert_allclose, assert_array_equal
+from strange_logs import strange
 
 import coopoc as co
 from coopoc.arrays import Floats
@@ -65,6 +66,14 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
     "a partner without a place": (
         lambda f: pd.concat([f, f[f["range"].notna()].assign(partner="anchor")]),
         r"\d+% of what was logged is not used, first of all \d+ relative measurements of members without a position",
+    ),
+    "another frame": (
+        lambda f: f.assign(x=f["x"] + 4e6 * f["vehicle"].eq("car1")),
+        "car1: its fixes lie 4000 km from all",
+    ),
+    "velocities of the past": (
+        lambda f: f.assign(t=f["t"] + 0.06 * f["vx"].notna()),
+        r"car0: its odometry is 0\.0[56]\d* \+- \S+ s later than the truth, its fixes are not",
     ),
     "leap seconds": (lambda f: f.assign(t=f["t"] + 18 * f["x"].notna()), r"car1: its fixes are 18 s behind the"),
     "a fix held": (lambda f: f.assign(x=f["x"].where(~f["t"].between(9, 30), 5), y=0 * f["x"]), "fixes that stay"),
@@ -176,38 +185,24 @@ def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path):
         assert ("above the truth" in text) == bool(up)
 
 
-def three(log: Path, **offsets: float) -> Path:
-    """Three cars, whose ranges are too long by pair."""
-    fleet = bends(3)
-    log.mkdir()
-    for seed, name in enumerate(fleet.ids):
-        write(pd.concat([fixes(fleet, name, 0.2, 0.5, seed), motion(fleet, name, 0.1, 0.1, seed)]), log / f"{name}.csv")
-        for other in fleet.ids[:seed]:
-            frame = ranges(fleet, name, other, 0.2, 0.1, seed)
-            frame["range"] += offsets.get(f"{other}_{name}", 0.0)
-            write(frame, log / f"{name}_{other}.csv")
-    return log
-
-
 @pytest.mark.parametrize(("who", "offset"), [("logged", 0.8), ("not logged", 0.8), ("logged", 20.0)])
 def test_an_offset_of_the_ranges_of_one_is_named(tmp_path, who, offset):
-    log = three(tmp_path / "log", car0_car2=offset, car1_car2=offset)
+    log = strange(tmp_path / "log", "drone", seconds=90, pairs={(f"drone{k}", "drone2"): offset for k in (0, 1, 3)})
+    (log / "truth.csv").unlink()
     text = said(read_log(log, std=None if who == "logged" else {"range": 1.0}))
-    assert "car0 and car2 by +" in text
-    assert "car1 and car2 by +" in text
-    assert "car0 and car1" not in text
-    assert "offset=car" in text
+    assert len(re.findall("drone2 (?:and drone. )?by [+]", text)) == text.count(" by +") == 3
+    assert "offset=drone" in text
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path, known):
     """Those that were added, to 0.03 m with a truth and 0.1 m without one; they are gone from the rest."""
-    path, fleet = three(tmp_path / "log", car0_car1=0.5, car0_car2=-0.3), bends(3)
-    if known:
-        write(pd.concat([fixes(fleet, name, 0.1, 1e-9) for name in fleet.ids]), path / "truth.csv")
+    path = strange(tmp_path / "log", "drone", pairs={("drone0", "drone1"): 0.5, ("drone0", "drone2"): -0.3})
+    if not known:
+        (path / "truth.csv").unlink()
     (option,) = re.findall(r"offset=(\S+) takes", said(load_log(f"{path}?until=80")))
     found = {pair: float(by) for pair, _, by in (each.partition(":") for each in option.split(","))}
-    assert found == pytest.approx({"car0-car1": 0.5, "car0-car2": -0.3}, abs=0.03 if known else 0.1)
+    assert found == pytest.approx({"drone0-drone1": 0.5, "drone0-drone2": -0.3}, abs=0.03 if known else 0.1)
     assert "offset=" not in said(load_log(f"{path}?offset={option}&since=80"))
 
 
@@ -302,26 +297,23 @@ def turned_drive(folder: Path, speed: Callable[[Floats], Floats], turn: float, s
     return folder
 
 
-def test_a_turned_odometry_on_a_circle_is_no_late_clock(tmp_path):
-    """Positions that it draws aside lie behind those of the filter along a bend: fixes passed for 0.5 s late."""
-    log = turned_drive(tmp_path / "log", lambda t: np.full(len(t), 10.0), 0.05)
-    (log / "truth.csv").unlink()
-    sentences = said(read_log(log, std={"x": 1.0, "y": 1.0}))
-    assert "its odometry is turned by 2." in sentences
-    assert "behind" not in sentences
-
-
-def test_what_moves_half_of_the_time_is_no_outlier(tmp_path):
-    """A turn of 3 degrees, of a car that stands half of the time, was 0 +- 0 beside a truth."""
-    log = turned_drive(tmp_path / "log", lambda t: np.clip(10 * np.sin(t * np.pi / 20), 0, None), 0.05)
-    sentences = said(read_log(log, std={"x": 1.0, "y": 1.0}))
-    assert re.search(r"its odometry is turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg", sentences)
-
-
-def test_a_forward_axis_that_points_back_is_no_late_odometry(tmp_path):
-    """Of speeds that count backwards it was 0.2 s early beside the truth."""
-    log = turned_drive(tmp_path / "log", lambda t: 10 + 4 * np.sin(t / 2), np.pi)
-    assert re.fullmatch(r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*", said(read_log(log)))
+@pytest.mark.parametrize(
+    ("speed", "turn", "words"),
+    [
+        (lambda t: 0 * t + 10, 0.05, r"(?!(.|\n)*behind)(.|\n)*its odometry is turned by 2\."),
+        (lambda t: 10 * np.sin(t * np.pi / 20).clip(0), 0.05, r".*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
+        (lambda t: 10 + 4 * np.sin(t / 2), np.pi, r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*$"),
+    ],
+    ids=["on a circle", "half of the time", "back"],
+)
+def test_odometry_that_is_turned_is_nothing_else(tmp_path, speed, turn, words):
+    """On a circle, without a truth, fixes passed for 0.5 s late: positions that it draws aside lie behind those of the
+    filter. Of a car that stands half of the time 3 degrees were 0 +- 0, and speeds that count backwards 0.2 s early."""
+    log = turned_drive(tmp_path / "log", speed, turn)
+    if "behind" in words:
+        (log / "truth.csv").unlink()
+    text = said(read_log(log, std={"x": 1.0, "y": 1.0}))
+    assert re.match(words, text), text
 
 
 def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):

@@ -38,15 +38,7 @@ from .estimates import (
 )
 from .motion import HOLDS, OTHER_RATES
 from .read import Log
-from .relative import (
-    LEAST_OUTLIERS,
-    OUTLIER_SHARE,
-    measurements,
-    misplaced,
-    of_measurements,
-    of_places,
-    of_ranges,
-)
+from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
 from .residuals import Check, filtered, without, without_wild
 
 WRONG_UNITS = (
@@ -68,6 +60,8 @@ AXIS_TURN = 20.0
 """Degrees by which odometry is turned from which its forward axis is another."""
 PERHAPS = 2.0
 """Standard errors from which an error may be real, and is named as not known."""
+FAR_AWAY = 3e5
+"""m, from all others, where no vehicle cooperates."""
 LEAST_BACK = 0.02
 """Share of the way that a vehicle goes back, if it does."""
 DIVERGED = 0.3
@@ -105,7 +99,9 @@ def check(log: Log) -> Check:
     first = filtered(log)
     first = without_wild(replace(first, failing=_failing(first) if log.recording.body is None else {}))
     rows = _vehicles(first)
-    drifts = [first.world.ids.index(row["vehicle"]) for row in rows if _drifts(first, row)]
+    least = {"speed_excess": LEAST_SCALE, "turned": LEAST_TURN, "yaw_rate_bias": LEAST_DRIFT, "fixes_late_s": BEHIND}
+    err = [row["vehicle"] in first.failing or any(_beyond(row, *one) for one in least.items()) for row in rows]
+    drifts = [first.world.ids.index(row["vehicle"]) for row, errs in zip(rows, err, strict=True) if errs]
     alike = not drifts and not any(_beyond(row, "nis", OUTLYING) for row in rows)
     late = [row["vehicle"] for row in rows if _late(first, row)]
     result = on_time(first if log.recording.body else without(first, drifts), alike, against_truth(first, late))
@@ -124,10 +120,8 @@ def _failing(c: Check) -> dict[str, str]:
     """Vehicles whose odometry fixes correct, and when."""
     rec = c.world
     corrections = faults(rec, np.arange(len(rec.ids)), NoiseModel.nominal(rec.sensors))
-    if corrections is None:
-        return {}
-    steps = zip(rec.ids, failed(corrections, rec.dt).T, strict=True)
-    return {name: when(rec.t - rec.t[0], each) for name, each in steps if each.any()}
+    steps = () if corrections is None else failed(corrections, rec.dt).T
+    return {name: when(rec.t - rec.t[0], each) for name, each in zip(rec.ids, steps, strict=False) if each.any()}
 
 
 def _wider(c: Check) -> Check:
@@ -181,9 +175,16 @@ def _rms(vectors: Floats) -> float | None:
 
 
 def _axes(c: Check, column: int) -> str:
-    """What is wrong with the axes of velocities that explain the fixes once they are mirrored, or whose direction never
-    changes while that of the fixes does; nothing where they agree."""
+    """What is wrong with fixes that are far from all others, or with the axes of velocities that explain the fixes once
+    they are mirrored, or whose direction never changes while that of the fixes does; nothing where they agree."""
     rec = c.world
+    east, north = (pd.DataFrame(rec.gnss[0, ..., axis]).median() for axis in (0, 1))
+    away = np.hypot(east - east[column], north - north[column]).drop(column).min()
+    if away > FAR_AWAY:
+        return (
+            f"its fixes lie {away / 1000:.0f} km from all others: is the sign of a latitude or longitude lost, are "
+            "both swapped, or is it in another frame?"
+        )
     moved, driven, *_ = moves(c, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
     u = rec.velocity[0, rec.present[:, column], column, :2]
@@ -354,13 +355,7 @@ def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
 
 def _late(c: Check, row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row is late beside the truth."""
-    return _beyond(row, "late_s", max(LEAST_LAG, 0.5 * c.world.dt))
-
-
-def _drifts(c: Check, row: Mapping[str, Any]) -> bool:
-    """Whether the odometry of a row errs."""
-    least = {"speed_excess": LEAST_SCALE, "turned": LEAST_TURN, "yaw_rate_bias": LEAST_DRIFT, "fixes_late_s": BEHIND}
-    return row["vehicle"] in c.failing or any(_beyond(row, *one) for one in least.items())
+    return _beyond(row, "late_s", max(LEAST_LAG, 0.1 * c.world.dt))
 
 
 def _of_clocks(c: Check) -> list[str]:

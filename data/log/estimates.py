@@ -61,13 +61,7 @@ class Estimate(NamedTuple):
     error: Floats
 
 
-def factors(
-    y: AnyArray,
-    x: AnyArray,
-    noise: float,
-    groups: Ints | None = None,
-    z: AnyArray | None = None,
-) -> Estimate:
+def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, z: AnyArray | None = None) -> Estimate:
     """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, less the means of groups (M,);
     and standard errors, as leaving out each part of the drive changes them. None is known where half of y stays, and
     that is OUTLYING times its noise: something else is wrong.
@@ -283,10 +277,10 @@ def _polar(turned: complex) -> Floats:
     return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
 
 
-def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimate, AnyArray]:
+def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimate, AnyArray, Ints]:
     """By what each vehicle's clock is ahead of that of a reference, or of one that most agree with, s; if `alike`, by
-    what share all ranges are too long, and by what they are late, s: (N + 2,), and what a range or direction misses for
-    1 of each (L, 2, N + 2).
+    what share all ranges are too long, and by what they are late, s: (N + 2,), what a range or direction misses for 1
+    of each (L, 2, K) that may be other than 0, and which these are: the clock of what stands shows nowhere.
 
     Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
     unit vector from i to j; where ranges are d s late, u (v_i - v_j) d.
@@ -294,7 +288,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     links, size = c.world.links, len(c.world.ids)
     gap, _ = residual_of(c.world, c.x)
     flat, far = distances(gap)
-    ends = np.eye(size)[links.neighbour] - np.eye(size)[links.observer]
+    which = np.append(np.flatnonzero(~c.still), [size, size + 1])
+    eye = np.eye(size)[:, which[:-2]]
+    ends = eye[links.neighbour] - eye[links.observer]
 
     def made_by(velocity: Floats) -> Floats:
         moves = velocity[links.step, links.neighbour]
@@ -305,23 +301,23 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
         return np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
 
     velocity = np.nan_to_num(c.world.velocity[0])
-    columns = np.arange(size + 2)
-    used = (columns < size + 2 * alike) & (columns != reference)
+    used = (which < size + 2 * alike) & (which != reference)
     made, then = (used * made_by(each) for each in (velocity, following(c, velocity)))
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
     x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
-    value, error = factors(c.relative[there, 0], x, noise, groups, z)
-    measured = np.flatnonzero(ends[there].any(axis=0))
+    value, error = np.zeros(size + 2), np.full(size + 2, np.inf)
+    value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z)
+    measured = np.unique(pairs[:, there])
     stay = max(noise**2 - c.world.sensors.range_std**2, 0.0) * share(c) / max(len(measured), 1)
-    varied = pd.DataFrame(x[:, size:]).groupby(groups).transform("var", ddof=0).mean().clip(1e-12)
+    varied = pd.DataFrame(x[:, -2:]).groupby(groups).transform("var", ddof=0).mean().clip(1e-12)
     error[size:] = np.hypot(error[size:], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
     error[measured[measured == reference]] = 0.0
     if reference is None and len(measured):
         apart = np.abs(np.subtract.outer(value[measured], value[measured]))
         return clocks(c, alike, measured[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))])
-    return Estimate(value, ERRORS_LAST * error), made
+    return Estimate(value, ERRORS_LAST * error), made, which
 
 
 def share(c: Check) -> float:
@@ -410,7 +406,7 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
 def on_time(c: Check, alike: bool, true: Check) -> Check:
     """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share (by
     `true` positions, if there are some), and less what wrong ones explain."""
-    (value, error), made = clocks(c, alike)
+    (value, error), made, which = clocks(c, alike)
     size = len(c.world.ids)
     if alike and c.log.truth is not None:
         value[size:], error[size:] = (part[size:] for part in clocks(true, True)[0])
@@ -421,7 +417,7 @@ def on_time(c: Check, alike: bool, true: Check) -> Check:
     error[:size][np.abs(value[:size]) > LONG_LAG] = np.inf  # what is linear in a lag holds for small ones
     off = np.where(np.abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
-    relative[:, :2] -= np.nan_to_num(made @ off)
+    relative[:, :2] -= np.nan_to_num(made @ off[which])
     ranges = tuple(zip(off[size:], error[size:], strict=True))
     return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], ranges=ranges)
 

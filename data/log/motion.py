@@ -375,12 +375,10 @@ def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:
 
 def _longest(there: Bools, grid: Floats) -> str:
     """The longest gap between steps of a member, in words; none of less than a second."""
-    at = np.flatnonzero(there)
-    gaps = np.diff(grid[at])
-    if not len(gaps) or gaps.max() < 1.0:
-        return ""
-    k = np.argmax(gaps)
-    return f", longest gap {gaps[k]:.1f} s from {grid[at[k]] - grid[0]:.1f} s on"
+    at = grid[there]
+    gaps = np.append(0.0, np.diff(at))
+    k = gaps.argmax()
+    return f", longest gap {gaps[k]:.1f} s from {at[k - 1] - grid[0]:.1f} s on" if gaps[k] >= 1.0 else ""
 
 
 def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:

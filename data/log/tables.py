@@ -11,17 +11,7 @@ import pandas as pd
 from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError, suggestion
 
-from ..cells import (
-    filled,
-    headers,
-    missing_column,
-    named_columns,
-    numeric,
-    read_frame,
-    seconds,
-    usual_key,
-    words,
-)
+from ..cells import filled, headers, missing_column, named_columns, numeric, read_frame, seconds, usual_key, words
 from .units import KINDS, Rows, Summary, in_group, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
