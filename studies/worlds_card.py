@@ -103,7 +103,8 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
     for name in methods:
         began, file = time.perf_counter(), card_file(name, out, seed, validation)
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
-        write(file, card_text(cards[-1]))
+        lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in cards[-1].items())
+        write(file, "{\n" + ",\n".join(lines) + "\n}\n")  # a card is read by people and kept in a repository
         print(details(cards[-1]), end="\n\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
     print(overview(cards))
@@ -220,11 +221,6 @@ def _worst(name: str, split: Split, scored: "pd.DataFrame") -> list[Row]:
         }
         for one in scored.sort_values("over_better", ascending=False, kind="stable").head(10).to_dict("records")
     ]
-
-
-def card_text(card: Params) -> str:
-    """JSON with a line for each part: a card is read by people and kept in a repository."""
-    return "{\n" + ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in card.items()) + "\n}\n"
 
 
 def overview(cards: Sequence[Params]) -> str:

@@ -75,7 +75,7 @@ def written(folder: Path, **options: Any) -> Path:
     log, truth = table(**options)
     folder.mkdir(exist_ok=True)
     log.to_csv(folder / "log.csv", index=False)
-    truth.to_csv(folder / "truth.csv", index=False)
+    truth.to_csv(folder / "truth.csv")
     return folder
 
 
@@ -113,7 +113,7 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path):
     folder = written(tmp_path / "log", noise=1.0, compass=False)
     frame = pd.read_csv(folder / "log.csv")
     kept = frame["vehicle"].isin(["red", "mast"]) | ~frame["kind"].isin(["x", "y"])
-    frame[kept].to_csv(folder / "log.csv", index=False)
+    frame[kept].to_csv(folder / "log.csv")
     log = co.read_log(folder, frame="body")
     begin, cars = co.pose_start(log.recording)[0], drives()
     for name, (place, heading, _, _) in cars.items():
@@ -123,7 +123,7 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path):
     track = co.PoseFilter("fleet", begin=begin[None])(log.recording, list(CARS))
     assert np.nanmean(co.pose_nees(track, log.truth)[:, 100:]) < 6
     kept &= ~frame["kind"].isin(["bearing", "range"]) | (frame["partner"] != "red")
-    frame[kept].to_csv(folder / "log.csv", index=False)
+    frame[kept].to_csv(folder / "log.csv")
     lost = co.read_log(folder, frame="body")
     with refused("has no fix and sees too little"):
         co.pose_start(lost.recording)
@@ -134,7 +134,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
     frame, _ = table()
     frame = frame[~frame["kind"].isin(["x", "y"]) | (frame["vehicle"] == "mast")]
     more = [(0.4, "mast", "bearing", "red", 0.3, 0.1), (0.4, "red", "vx", "", 1.0, 0.1)]
-    pd.concat([frame, pd.DataFrame(more, columns=frame.columns)]).to_csv(tmp_path / "log.csv", index=False)
+    pd.concat([frame, pd.DataFrame(more, columns=frame.columns)]).to_csv(tmp_path / "log.csv")
     log = co.read_log(tmp_path / "log.csv", frame="body")
     columns = [log.recording.ids.index(name) for name in CARS]
     assert np.isnan(log.recording.gnss[:, :, columns]).all()
@@ -157,7 +157,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
 )
 def test_mistakes_are_named(tmp_path, drop, options, message):
     frame, _ = table()
-    frame[(frame["kind"] != drop) | (frame["vehicle"] != "red")].to_csv(tmp_path / "log.csv", index=False)
+    frame[(frame["kind"] != drop) | (frame["vehicle"] != "red")].to_csv(tmp_path / "log.csv")
     with refused(message):
         co.read_log(tmp_path / "log.csv", **options)
 
@@ -177,7 +177,7 @@ def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path, mirro
 @pytest.mark.parametrize(("frame", "hint"), [("world", "They look like bearings"), ("body", "Then name them bearing")])
 def test_bearings_that_are_called_azimuths_are_named(tmp_path, frame, hint):
     log, _ = table(noise=1.0, compass=frame == "world")
-    log.replace({"kind": {"bearing": "azimuth"}}).to_csv(tmp_path / "log.csv", index=False)
+    log.replace({"kind": {"bearing": "azimuth"}}).to_csv(tmp_path / "log.csv")
     assert hint in "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame=frame)).warnings)
 
 
@@ -194,7 +194,7 @@ def test_axes_that_are_turned_or_flipped_are_named(tmp_path, kind, change, said)
     own = log["kind"] == kind
     value = change[0] * log["value"][own] + change[1]
     log.loc[own, "value"] = wrapped(value) if kind == "bearing" else value
-    log.to_csv(tmp_path / "log.csv", index=False)
+    log.to_csv(tmp_path / "log.csv")
     words = "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame="body")).warnings)
     assert re.search(said, words)
     assert "too fast" not in words
@@ -203,7 +203,7 @@ def test_axes_that_are_turned_or_flipped_are_named(tmp_path, kind, change, said)
 def test_the_check_scores_those_whose_truth_is_known(tmp_path):
     folder = written(tmp_path / "log", noise=1.0)
     truth = table()[1]
-    truth[truth["vehicle"] == "blue"].assign(x=lambda frame: frame["x"] + 50).to_csv(folder / "truth.csv", index=False)
+    truth[truth["vehicle"] == "blue"].assign(x=lambda frame: frame["x"] + 50).to_csv(folder / "truth.csv")
     found = check_poses(co.read_log(folder, frame="body"))
     assert [row["error_m"] is not None for row in found.vehicles] == [
         row["vehicle"] == "blue" for row in found.vehicles
@@ -216,7 +216,7 @@ def test_the_check_scores_those_whose_truth_is_known(tmp_path):
 def test_what_no_filter_can_follow_is_still_summarised(tmp_path):
     frame, _ = table(compass=False)
     frame = frame[~frame["kind"].isin(["x", "y"]) & (frame["vehicle"] != "mast")]
-    frame.to_csv(tmp_path / "log.csv", index=False)
+    frame.to_csv(tmp_path / "log.csv")
     command = [sys.executable, "-m", "coopoc.cli", "data", "check", "log.csv?frame=body"]
     done = ran(command, cwd=tmp_path, check=True)
     assert "400 samples of odometry" in done.stdout

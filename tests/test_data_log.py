@@ -247,7 +247,7 @@ def circle(t: float) -> tuple[Any, float]:
 
 def read_rows(rows: list[tuple[Any, ...]], folder: Path, **options: Any) -> co.Recording:
     file = folder / "log.csv"
-    pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value"]).to_csv(file, index=False)
+    pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value"]).to_csv(file)
     return co.read_log(file, **options).recording
 
 

@@ -389,7 +389,7 @@ def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
         (tmp_path / name / "mast.csv").write_text("vehicle,x,y\nmast,0,0\n")
         frame = car.astype(dict.fromkeys(kinds, float))
         frame.loc[frame.index[rows], kinds] = cell
-        frame.to_csv(tmp_path / name / "car.csv", index=False)
+        frame.to_csv(tmp_path / name / "car.csv")
     a, b = (read_log(tmp_path / name) for name in "ab")
     assert same(a.recording, b.recording)
     assert sum(number for why, (number, _) in a.summary.refused.items() if "none" in why) == 15 * len(kinds)
@@ -397,7 +397,7 @@ def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
         with refused("row 4"):
             read_log(tmp_path / "one")
     car["heading"] = np.round(4 + 4.4 * np.sin(t / 5))  # whole degrees for radians: no number stands for none
-    car.to_csv(tmp_path / "a" / "car.csv", index=False)
+    car.to_csv(tmp_path / "a" / "car.csv")
     with refused("heading = [78]: must be within"):
         read_log(tmp_path / "a")
 
@@ -406,8 +406,8 @@ def test_ranges_that_end_at_the_most_that_is_measured_are_left_out(tmp_path):
     """The same log without them is the reference."""
     rows, far = pd.read_csv(strange(tmp_path / "a", "drone") / "log.csv"), 60.0
     (tmp_path / "b").mkdir()
-    rows.assign(range=rows["range"].clip(upper=far)).to_csv(tmp_path / "a" / "log.csv", index=False)
-    rows[~rows["range"].ge(far)].to_csv(tmp_path / "b" / "log.csv", index=False)
+    rows.assign(range=rows["range"].clip(upper=far)).to_csv(tmp_path / "a" / "log.csv")
+    rows[~rows["range"].ge(far)].to_csv(tmp_path / "b" / "log.csv")
     one, other = (read_log(tmp_path / name) for name in "ab")
     assert 100 < len(other.recording.links) < 0.9 * rows["range"].count()
     assert same(one.recording, other.recording)

@@ -67,7 +67,7 @@ def log(
 
 def error(read: Log, method: co.Method) -> float:
     assert read.truth is not None
-    return float(co.rt_le(method(read.recording), read.truth)[0, 0])
+    return co.rt_le(method(read.recording), read.truth)[0, 0]
 
 
 def filtered(t: Floats, z: Floats, std: float, density: float) -> tuple[Floats, Floats]:
@@ -125,7 +125,7 @@ def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_
     own = axes(turn.inv().apply(u), "_body") | axes(std, "_body_std") | ({} if apart else q)
     log(tmp_path / "body", "drone", 0.1, 10, **own, yaw_rate=0 * T + 0.3)
     if apart:
-        pd.DataFrame(q).assign(t=T, vehicle="a").to_csv(tmp_path / "body/imu.csv", index=False)
+        pd.DataFrame(q).assign(t=T, vehicle="a").to_csv(tmp_path / "body/imu.csv")
     read = co.read_log(tmp_path / "body", frame=frame)
     assert "forward, y left, z up" in " ".join(read.recording.notes)
     world = in_world(read.recording) if frame == "body" else read.recording
@@ -164,7 +164,7 @@ def test_each_fix_counts_as_it_is_stated(tmp_path):
 
 def test_a_vehicle_without_odometry_adds_no_noise_to_that_of_others(tmp_path):
     alone = log(tmp_path, "car", 1.5, 10, vx=SPEED * np.cos(COURSE), vy=SPEED * np.sin(COURSE), vz=0 * T)[0]
-    pd.read_csv(tmp_path / "a.csv", usecols=["t", *"xyz"]).dropna().to_csv(tmp_path / "b.csv", index=False)
+    pd.read_csv(tmp_path / "a.csv", usecols=["t", *"xyz"]).dropna().to_csv(tmp_path / "b.csv")
     both = co.read_log(tmp_path)
     for method in (*FILTERS, co.BatchSmoother()):
         assert_allclose(method(both.recording, ["a"]).x, method(alone.recording, ["a"]).x, atol=1e-6)
@@ -237,7 +237,7 @@ def test_nothing_looks_ahead(tmp_path, given):
     rows = pd.read_csv(tmp_path / "as it was" / "a.csv")
     rows.loc[rows["t"] == 120.0, "x"] += 40.0
     (tmp_path / "moved").mkdir()
-    rows.to_csv(tmp_path / "moved" / "a.csv", index=False)
+    rows.to_csv(tmp_path / "moved" / "a.csv")
     moved = co.read_log(tmp_path / "moved").recording
     moved = replace(moved, sensors=read.recording.sensors, motion_variance=read.recording.motion_variance)
     before = read.recording.t < 119.99
@@ -293,7 +293,7 @@ STRANGE = {
 def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     """Without noise: no estimate is farther from a fix than its standard deviation once there have been four."""
     speed, t = STRANGE[name]
-    pd.DataFrame({"t": t, "vehicle": "a", "x": speed * t, "y": 0.0}).to_csv(tmp_path / "a.csv", index=False)
+    pd.DataFrame({"t": t, "vehicle": "a", "x": speed * t, "y": 0.0}).to_csv(tmp_path / "a.csv")
     rec = co.read_log(tmp_path / "a.csv").recording
     known = np.flatnonzero(np.isfinite(rec.gnss[0, :, 0, 0]))
     assert len(known) == len(t)
@@ -314,7 +314,7 @@ NONE = {
 def test_numbers_that_stand_for_none_are_none(tmp_path, what):
     log(tmp_path, "car", 1.0, 10, speed=SPEED, heading=COURSE)
     rows = pd.read_csv(tmp_path / "a.csv")
-    NONE[what](rows, rows["t"].between(100, 114)).to_csv(tmp_path / "a.csv", index=False)
+    NONE[what](rows, rows["t"].between(100, 114)).to_csv(tmp_path / "a.csv")
     read = co.read_log(tmp_path)
     assert np.nanmax(np.abs(read.recording.gnss[0] - read.truth.position)) < 6.0
     assert np.nanmax(np.abs(read.recording.velocity)) < 20.0
@@ -329,7 +329,7 @@ def test_fixes_that_are_held_are_a_gap_where_nothing_else_moves(tmp_path, held):
     part = rows["t"].between(120, 150)
     columns = ["x", "y", "z"] if held else ["yaw_rate"]
     rows.loc[part, columns] = rows.loc[~part & rows["t"].lt(120), columns].iloc[-1].to_numpy() if held else np.nan
-    rows.to_csv(tmp_path / "a.csv", index=False)
+    rows.to_csv(tmp_path / "a.csv")
     read = co.read_log(tmp_path)
     assert np.isnan(read.recording.velocity[0, :, 0, 0])[np.searchsorted(read.recording.t, [130.0, 140.0])].all()
     assert error(read, co.Kalman()) < 2.0
@@ -338,7 +338,7 @@ def test_fixes_that_are_held_are_a_gap_where_nothing_else_moves(tmp_path, held):
 @pytest.mark.parametrize("every", [1, 20])
 def test_a_truth_may_be_seldom_and_without_heights(tmp_path, every):
     read, *_ = log(tmp_path, "hill", 1.0, 10, **axes(np.gradient(path("hill"), 0.1, axis=0)))
-    pd.read_csv(tmp_path / "truth.csv").drop(columns="z")[::every].to_csv(tmp_path / "truth.csv", index=False)
+    pd.read_csv(tmp_path / "truth.csv").drop(columns="z")[::every].to_csv(tmp_path / "truth.csv")
     assert error(co.read_log(tmp_path), co.Kalman()) < 1.5 * error(read, co.Kalman()) + 0.3
 
 
@@ -357,7 +357,7 @@ def test_what_a_log_holds_beside_its_odometry_is_named(tmp_path, fault, named):
     rows = pd.read_csv(tmp_path / "a.csv")
     if fault == "smoothed":
         rows[[*"xyz"]] = rows[[*"xyz"]].interpolate().ewm(com=8).mean().where(rows[[*"xyz"]].notna())
-    rows.to_csv(tmp_path / "a.csv", index=False)
+    rows.to_csv(tmp_path / "a.csv")
     warnings = check(co.read_log(tmp_path)).warnings
     assert re.search(named, "\n".join(warnings))
     assert not re.search("too (fast|slow)|is turned by", "\n".join(warnings))

@@ -67,8 +67,8 @@ def test_joint_is_best_intersection_is_cautious_and_naive_is_not():
     tracks = {name: co.PoseFilter("fleet", fusion=name)(seen, range(5)) for name in ("joint", "naive", "intersection")}
     assert (tracks["naive"].sent_bytes == 200 * 64).all()
     tracks["solo"] = co.PoseFilter("solo")(seen, range(5))
-    error = {name: float(co.rt_le(track, fleet).mean()) for name, track in tracks.items()}
-    nees = {name: float(co.pose_nees(track, fleet).mean()) for name, track in tracks.items()}
+    error = {name: co.rt_le(track, fleet).mean() for name, track in tracks.items()}
+    nees = {name: co.pose_nees(track, fleet).mean() for name, track in tracks.items()}
     assert error["joint"] < error["intersection"] < error["solo"]
     assert error["joint"] < error["naive"]
     assert nees["naive"] > 6.0
@@ -120,7 +120,7 @@ def test_the_gate_keeps_outliers_out():
     wrong = replace(seen, relative=relative)
 
     def error(recording, gate):
-        return float(co.rt_le(co.PoseFilter("fleet", gate=gate)(recording, [1, 2]), fleet).mean())
+        return co.rt_le(co.PoseFilter("fleet", gate=gate)(recording, [1, 2]), fleet).mean()
 
     clean = error(seen, np.inf)
     assert error(wrong, 5.0) < 1.1 * clean

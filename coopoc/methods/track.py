@@ -238,8 +238,9 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
             if not pieces:
                 never = "is never present at two successive steps with a fix"
                 raise InputError("egos", repr(recording.ids[column]), never, "Choose another ego.")
+        later = self if getattr(self, "x0", None) is None else replace(self, x0=None)
         parts = {
-            (column, cut): call(_from(self, cut[0]), recording.between(*cut), [recording.ids[column]])
+            (column, cut): call(later if cut[0] > 0 else self, recording.between(*cut), [recording.ids[column]])
             for column in columns
             for cut in cuts[column]
         }
@@ -269,11 +270,6 @@ def noted(track: Track) -> Track:
         raise InputError("egos", repr(track.ids[ego]), "has no fix, and no neighbour shows where it is", hint)
     gaps = f"absent, or not placed yet, at {track.absent.sum()} of {track.absent.size} steps: no estimate there"
     return replace(track, notes=tuple(dict.fromkeys((*track.notes, gaps))))
-
-
-def _from(method: Any, start: int) -> Any:
-    """The method at a later start, where a first position is not known."""
-    return replace(method, x0=None) if start > 0 and getattr(method, "x0", None) is not None else method
 
 
 def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tuple[int, int]], Track]) -> Track:

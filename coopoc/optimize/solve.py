@@ -89,7 +89,8 @@ def solve(
     array([-0.333,  9.333])
     """
     instance("problem", problem, Problem)
-    chosen = _chosen(problem) if backend is None else require_backend(backend)
+    able = (one for one in map(require_backend, DEFAULTS) if not one.capabilities.lacking(problem))
+    chosen = next(able, require_backend(DEFAULTS[0])) if backend is None else require_backend(backend)
     instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
     wanted = len(problem.names) <= COVARIANCE_NODES if covariance is None else instance("covariance", covariance, bool)
     if not problem.factors:
@@ -102,12 +103,6 @@ def solve(
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
     return solution
-
-
-def _chosen(problem: Problem) -> Backend:
-    """The first of DEFAULTS that can solve a problem, else the first."""
-    able = (one for one in map(require_backend, DEFAULTS) if not one.capabilities.lacking(problem))
-    return next(able, require_backend(DEFAULTS[0]))
 
 
 def _solved(problem: Problem, backend: Backend, options: Options, covariance: bool) -> Solution:
