@@ -103,10 +103,10 @@ def noisy(rng: np.random.Generator, t: Any, name: str, columns: dict[str, tuple[
     )
 
 
-def star(t: Any, rng: Any, name: str, ways: Any, velocity: Any, seen: Any, std: float = 1.3) -> pd.DataFrame:
+def star(t: Any, rng: Any, name: str, ways: Any, velocity: Any, seen: Any) -> pd.DataFrame:
     """Velocities, fixes and ranges to all others of one of those on complex `ways`, in a wide table."""
-    columns = {"vx": (velocity.real, 0.1), "vy": (velocity.imag, 0.1), "x": (seen.real, std), "y": (seen.imag, std)}
-    reach = {f"range_{other}": (abs(way - ways[name]), 0.2) for other, way in ways.items() if other != name}
+    columns = {"vx": (velocity.real, 0.1), "vy": (velocity.imag, 0.1), "x": (seen.real, 1.3), "y": (seen.imag, 1.3)}
+    reach = {f"range_{other}": (abs(way - ways[name]), 0.1) for other, way in ways.items() if other != name}
     return noisy(rng, t, name, columns | reach)
 
 

@@ -64,8 +64,8 @@ def table(noise: float = 0.0, mirrored: bool = False, compass: bool = True) -> t
                         apart = cars[other][0][i] - place[i]
                         turned = wrapped(np.arctan2(apart[1], apart[0]) - heading[i])
                         add(t, name, "bearing", -turned if mirrored else turned, other)
-                        add(t, name, "range", float(np.hypot(*apart)), other)
-                add(t, "mast", "range", float(np.hypot(*(place[i] - MAST))), name)
+                        add(t, name, "range", np.hypot(*apart), other)
+                add(t, "mast", "range", np.hypot(*(place[i] - MAST)), name)
     rows += [(0.0, "mast", "x", "", MAST[0], 0.01), (0.0, "mast", "y", "", MAST[1], 0.01)]
     log = pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value", "std"])
     return log, pd.DataFrame(truth, columns=["t", "vehicle", "x", "y", "heading"])
@@ -363,7 +363,7 @@ def test_wheels_of_another_size_cost_little_from_a_known_pose(tmp_path, share):
         told = replace(log.recording.sensors, speed_scale_std=0.0, yaw_rate_bias_std=0.0, range_offset_std=0.0)
         both = ["robot0", "robot1"]
         tracks = made(log.recording, both), replace(made, assumed=told)(log.recording, both)
-        found[wheels] = [float(co.rt_le(track, log.truth).mean()) for track in tracks]
+        found[wheels] = [co.rt_le(track, log.truth).mean() for track in tracks]
         scale, std = (tracks[0].extras[name][0, -1] for name in ("speed_scale", "speed_scale_std"))
         assert (np.abs(scale - wheels) < 4 * std).all()
     assert found[share][0] < 1.3 * found[0.0][0] < 0.5 * found[share][1]

@@ -1,9 +1,9 @@
 """What `coopoc data check` says of logs with faults that are easy to overlook, and what a log is read as."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
 
 import coopoc as co
-from coopoc.arrays import Floats
 from coopoc.data.log.check import check
 from coopoc.data.log.read import Log, read_log
 from coopoc.data.registry import read_log as load_log
@@ -24,7 +23,7 @@ def said(log: Log) -> str:
     return "\n".join(check(log).warnings)
 
 
-def cars(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame] = lambda frame: frame, rate: float = 0.1) -> Path:
+def cars(folder: Path, change: Any = lambda frame: frame, rate: float = 0.1) -> Path:
     """Two cars on a plane: fixes twice a second, odometry, ranges five times a second by the first alone."""
     fleet = bends()
     parts = [ranges(fleet, "car0", "car1", 0.2, 0.3)]
@@ -38,10 +37,6 @@ def cars(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame] = lambda f
     return folder
 
 
-def test_nothing_looks_wrong_where_nothing_is(tmp_path):
-    assert said(read_log(cars(tmp_path / "log"))) == ""
-
-
 def in_fixes(frame: pd.DataFrame) -> pd.DataFrame:
     here = np.flatnonzero(frame["x"].notna())[::20]
     return frame.assign(x=frame["x"].where(~frame.index.isin(here), frame["x"] + 15))
@@ -53,7 +48,8 @@ def body_twist(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.assign(vx=speed, vy=np.where(moves, 0.1 * np.sin(np.arange(len(frame))), np.nan))
 
 
-FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
+FAULTS: dict[str, tuple[Any, str]] = {
+    "none": (lambda f: f, "^$"),
     "one range of twenty": (lambda f: f.assign(range=outliers(f["range"])), r"[345]\.\d% of the ranges lie beyond 5"),
     "one fix of twenty": (in_fixes, r"car0: [45]\.\d% of the fixes lie beyond 5"),
     "stamps without their fraction": (
@@ -200,10 +196,10 @@ def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path, known):
     path = strange(tmp_path / "log", "drone", pairs={("drone0", "drone1"): 0.5, ("drone0", "drone2"): -0.3})
     if not known:
         (path / "truth.csv").unlink()
-    (option,) = re.findall(r"offset=(\S+) takes", said(load_log(f"{path}?until=80")))
+    (option,) = re.findall(r"offset=(\S+) takes", said(load_log(f"{path}?until=130")))
     found = {pair: float(by) for pair, _, by in (each.partition(":") for each in option.split(","))}
     assert found == pytest.approx({"drone0-drone1": 0.5, "drone0-drone2": -0.3}, abs=0.03 if known else 0.1)
-    assert "offset=" not in said(load_log(f"{path}?offset={option}&since=80"))
+    assert "offset=" not in said(load_log(f"{path}?offset={option}&since=130"))
 
 
 def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
@@ -282,7 +278,7 @@ def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
         assert ("to the antenna, of car (1.5, 0.5, 0 m forward, left, up, by" in " ".join(rec.notes)) == bool(option)
 
 
-def turned_drive(folder: Path, speed: Callable[[Floats], Floats], turn: float, seconds: float = 120.0) -> Path:
+def turned_drive(folder: Path, speed: Any, turn: float, seconds: float = 120.0) -> Path:
     """A car that goes round in circles or stops, fixes of 1 m once a second, headings turned by an angle."""
     folder.mkdir(exist_ok=True)
     rng, t = np.random.default_rng(1), np.arange(0, seconds, 0.04)
@@ -301,10 +297,9 @@ def turned_drive(folder: Path, speed: Callable[[Floats], Floats], turn: float, s
     ("speed", "turn", "words"),
     [
         (lambda t: 0 * t + 10, 0.05, r"(?!(.|\n)*behind)(.|\n)*its odometry is turned by 2\."),
-        (lambda t: 10 * np.sin(t * np.pi / 20).clip(0), 0.05, r".*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
+        (lambda t: 10 * np.sin(t * np.pi / 20).clip(0), 0.05, r"(.|\n)*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
         (lambda t: 10 + 4 * np.sin(t / 2), np.pi, r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*$"),
     ],
-    ids=["on a circle", "half of the time", "back"],
 )
 def test_odometry_that_is_turned_is_nothing_else(tmp_path, speed, turn, words):
     """On a circle, without a truth, fixes passed for 0.5 s late: positions that it draws aside lie behind those of the

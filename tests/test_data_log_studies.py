@@ -123,7 +123,7 @@ def test_ranges_help_or_do_no_harm(tmp_path, options, offset, most):
     without = replace(log.recording, relative=np.full_like(log.recording.relative, np.nan))
     tracks = [co.CooperativeFilter()(seen, fleet.ids) for seen in (log.recording, without)]
     tracks.append(co.Kalman()(without, fleet.ids))
-    rms = [float(np.sqrt(np.square(track.x[0] - true.transpose(2, 0, 1))[..., :2].mean())) for track in tracks]
+    rms = [np.sqrt(np.square(track.x[0] - true.transpose(2, 0, 1))[..., :2].mean()) for track in tracks]
     assert rms[0] < most * rms[1]
     assert rms[1] < 1.1 * rms[2]  # it was 1.4: a log that states its noise is believed
 

@@ -41,7 +41,7 @@ STARS = (
 @pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")
 def test_missing_fixes_cost_and_do_not_crash(crossing, method):  # type: ignore[no-untyped-def]
     whole = observe(crossing, Sensors(gnss_std=(4, 4, 4)), V2X(4, 80.0), runs=6)
-    some, few = (float(rt_le(method(holed(whole, share), [0, 3]), crossing).mean()) for share in (0.0, 0.7))
+    some, few = (rt_le(method(holed(whole, share), [0, 3]), crossing).mean() for share in (0.0, 0.7))
     assert np.isfinite(few)
     assert few < 4 * np.sqrt(3)
     assert method.name in ("fedkalmannet", "lkf-sa") or few > some
