@@ -280,8 +280,8 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
         rows += [{**at, "vehicle": "a", "y": 0.0}, *[{**at, "vehicle": "b", "y": 5.0}] * (now > period + 2)]
     plain, anew = (pd.DataFrame(rows) for _ in "ab")
     anew["t"] %= period
-    plain.to_csv(tmp_path / "plain.csv", index=False)
-    anew.to_csv(tmp_path / "anew.csv", index=False)
+    plain.to_csv(tmp_path / "plain.csv")
+    anew.to_csv(tmp_path / "anew.csv")
     one, other = (co.read_log(tmp_path / name) for name in ("plain.csv", "anew.csv"))
     assert same(one.recording, other.recording)
     assert other.summary.assumed.keys() - one.summary.assumed.keys() == {
@@ -289,7 +289,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
     }
     after, file = plain["t"] >= period, tmp_path / "truth.csv"
     for truth in (plain, anew, *[anew[after]] * (period % 86400 == 0)):
-        truth.drop(columns=["vx", "vy"]).to_csv(file, index=False)
+        truth.drop(columns=["vx", "vy"]).to_csv(file)
         for name, log in (("plain.csv", one), ("anew.csv", other)):
             actual = load_log(f"{tmp_path / name}?truth={file}").truth
             there = np.isfinite(actual.position[..., 0])

@@ -144,8 +144,8 @@ def log(tmp_path_factory):
                 rows += [(t, name, kind, v) for kind, v in zip(("x", "y"), fix, strict=True)]
     rows += [(0.0, "mast", "x", 50.0), (0.0, "mast", "y", 50.0)]
     folder = tmp_path_factory.mktemp("log")
-    pd.DataFrame(rows, columns=["t", "vehicle", "kind", "value"]).to_csv(folder / "measurements.csv", index=False)
-    pd.DataFrame(truth, columns=["t", "vehicle", "x", "y"]).to_csv(folder / "truth.csv", index=False)
+    pd.DataFrame(rows, columns=["t", "vehicle", "kind", "value"]).to_csv(folder / "measurements.csv")
+    pd.DataFrame(truth, columns=["t", "vehicle", "x", "y"]).to_csv(folder / "truth.csv")
     return folder
 
 
