@@ -135,7 +135,7 @@ def pose_measurements(
     relative, ends = recording.relative[:, links], number[[table.observer[links], table.neighbour[links]]]
     low, high = np.sort(ends, axis=0)
     pair = high * (high - 1) // 2 + low + 1
-    fixed: Bools = np.isfinite(recording.gnss[:, :, members, 0]).any(axis=(0, 1))  # fixes of both show it
+    fixed = np.isfinite(recording.gnss[:, :, members, 0]).max(axis=(0, 1))  # fixes of both show it
     pair *= fixed[ends].all(axis=0) & (low >= 0) & (pair <= MOST_PAIRS)
     return PoseMeasurements(
         np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], axis=3)),
