@@ -28,8 +28,8 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     are more than text.
 
     Raises:
-        InputError: an option without a value, or twice without pairs that add up, or with a value of another kind, a
-            data set that is to be fetched.
+        InputError: an option without a value, a name that has two, a value of another kind, a data set that is to be
+            fetched.
 
     >>> split("drive.csv?dt=0.1&columns=t:time,id:car")
     ('drive.csv', {'dt': 0.1, 'columns': {'t': 'time', 'id': 'car'}})
@@ -42,19 +42,22 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     name = name if os.path.exists(name) else str(local(name) or name)
     if not mark:
         return name, {}
-    options: dict[str, Any] = {}
+    texts: dict[str, str] = {}
     for part in query.split("&"):
         key, equals, value = part.partition("=")
-        if not (key and equals and value) or not isinstance(options.get(key, {}), dict):
+        texts[key] = f"{texts[key]},{value}" if key in texts else value
+        if not (key and equals and value):
             raise InputError(
                 "data",
                 repr(text),
                 "must give each option behind ? one value",
                 'Write NAME?option=value&option=value, such as "drive.csv?dt=0.1".',
             )
+    options = {}
+    for key, value in texts.items():
         read, allowed, example = READ.get(key, (str, "", ""))
         try:
-            options[key] = options[key] | read(value) if key in options else read(value)
+            options[key] = read(value)
         except ValueError:
             raise InputError(
                 key,
@@ -102,9 +105,9 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
 
 
 def pairs(text: str, value: Callable[[str], Any] = str) -> dict[str, Any]:
-    """Names and values, as "t:time,id:car", a comma of a name as %2C; ValueError for anything else."""
+    """Names and values, as "t:time,id:car", a comma of a name as %2C; ValueError for anything else, or a name twice."""
     made = [[unquote(word.strip()) for word in pair.partition(":")] for pair in text.split(",")]
-    if not all(map(all, made)):
+    if not all(map(all, made)) or len({name for name, *_ in made}) < len(made):
         raise ValueError(text)
     return {name: value(word) for name, _, word in made}
 
@@ -122,14 +125,15 @@ READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
     "columns": (pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
     "kinds": (pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
     **dict.fromkeys(
-        ("scale", "std", "offset"), (partial(pairs, value=float), "name:number pairs", "range:0.001,t:1e-3")
+        ("scale", "std", "offset"),
+        (partial(pairs, value=float), "name:number pairs, each name once", "range:0.001,t:1e-3"),
     ),
     "antenna": (
         lambda text: pairs(text, _place) if ":" in text else _place(text),
         "metres forward/left/up, or vehicle:forward/left/up pairs",
         "car1:1.2/0.3/0",
     ),
-    "clock": (partial(pairs, value=float), "vehicle:seconds pairs", "blue:0.35"),
+    "clock": (partial(pairs, value=float), "vehicle:seconds pairs, each vehicle once", "blue:0.35"),
     "ignore": (lambda text: tuple(map(str.strip, text.split(","))), "words between commas", "imu,lidar"),
     "origin": (_place, "latitude, longitude and height", "48.14,11.58,520"),
 }

@@ -335,6 +335,7 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path):
     for words, message in (
         ("origin=48.1,11.5", "must be latitude, longitude and height"),
         ("clock=a:soon", "must be vehicle:seconds pairs"),
+        ("clock=b:1&clock=b:2", "each vehicle once"),
         ("antenna=a:1/2", "must be metres forward/left/up"),
         ("kinds=uwb", "must be word:kind pairs"),
         ("dt=x", "must be a number of SI units"),
