@@ -657,7 +657,7 @@ class Oracle:
         judged = j != self.ego or any(i in s.last for i in s.members)
         doubtful = g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows))
         if doubtful:
-            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= -0.5 * FIX_GATE
+            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= 0
             if supported and j in s.trusted:
                 s.revoked[j] = s.revoked.get(j, 0) + 1
             elif not supported:
@@ -665,6 +665,7 @@ class Oracle:
             self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
+                s.agreed = s.agreed if s.jumped else 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0 if supported else 1.0

@@ -423,7 +423,7 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
             fix_terms(f, 0)
             q = innovate(f.g, f.h)
     spoken = speak_for(f, model, own, rows, count, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
-    use_fix(f, model, 0, True, q, spoken >= -0.5 * FIX_GATE, may_slip(own, FIX_VARIANCE, way * way))
+    use_fix(f, model, 0, True, q, spoken >= 0.0, may_slip(own, FIX_VARIANCE, way * way))
     corrected(f)
 
 

@@ -301,6 +301,8 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         elif f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
         set_trust(f, j, 0.0 if supported else 1.0, (TAU**2 if supported else 0.0) + model.own)
+        if k == 0 and f.ego[JUMPED] == 0.0:
+            f.ego[AGREED] = 0.0
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             f.member[0, LOCKED] = 0.0
             fix_terms(f, 0)
