@@ -1,17 +1,19 @@
 """What is said of an end: infinite costs, singular J^T J, saddles, mirror images, bounds; against SciPy and closed
 forms."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from conftest import DESCENTS
+from conftest import DESCENTS, refused
 from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
-from coopoc.optimize import Problem, Solution, Status, solve
+from coopoc.optimize import Problem, Solution, Status, pose, solve
 from coopoc.optimize.convex import certify
 from coopoc.optimize.graph_problems import _counted
+from coopoc.optimize.model.problem import Search
 
 
 def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float | Floats) -> Problem:
@@ -73,12 +75,33 @@ ANCHORS = np.array([[0, 0], [10, 0.0]])
 def test_a_saddle_between_two_anchors_is_one():
     """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line, of 4 and 6 m on it."""
     problem = ranged(ANCHORS, np.array([5, 0.0]), np.full(2, 15.0), 1.0)
-    found = solve(problem, throw=False)
+    found = solve(replace(problem, search=Search(x0=problem.x0)), throw=False)
     assert found.status is Status.SADDLE
     assert "this minimum" not in str(found.notes)
+    assert solve(problem).cost < 1e-9
     assert solve(ranged(ANCHORS, np.array([4, 0.1]), np.array([4.0, 6.0]), 0.1)).status is Status.SOLVED
     unknown = ranged(np.zeros((1, 2)), np.array([3, 4.0]), np.array([5.0]), 1.0)
     assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
+
+
+def test_an_end_that_is_no_minimum_says_why():
+    """Azimuths that part meet nowhere; of bearings of poses, three of ten wrong, some are met best where poses meet."""
+    parting = Problem("abr", x0=[*ANCHORS, [5, 8.0]], dimension=2, fixed=range(2))
+    parting = parting.add("azimuth", [(0, 2), (1, 2)], [2.36, 0.78], std=0.1)
+    with refused("r went .* m away: .* no place nearby"):
+        solve(parting)
+    pairs = np.array([(i, k) for i in (3, 4, 5) for k in range(3)] + [(3, 4)])
+    for seed in (9017, 9020, 9026):
+        rng = np.random.default_rng(seed)
+        at, turn = rng.uniform(-20, 20, (6, 2)), rng.uniform(-3, 3, 6)
+        gap = np.diff(at[pairs], axis=1)[:, 0]
+        z = np.arctan2(gap[:, 1], gap[:, 0]) - turn[pairs[:, 0]] + 0.02 * rng.normal(size=10)
+        bad = rng.random(10) < 0.3
+        z[bad] = rng.uniform(-3, 3, bad.sum())
+        poses = Problem("abcdef", x0=pose(at, turn), dimension=2, poses=range(6), fixed=range(3))
+        found = solve(poses.add("bearing", pairs, (z + np.pi) % (2 * np.pi) - np.pi, std=0.02), throw=False)
+        assert "nearly coincide" in str(found.notes) or found.status is Status.SOLVED
+        assert ("another step" in str(found.notes)) == (found.status is Status.FAILED)
 
 
 def test_ranges_that_do_not_meet_are_noted():

@@ -48,6 +48,8 @@ DRAWN_STEPS = 20
 """From each random place, of problems with constraints."""
 ASTRAY_SHARE = 0.25
 """Share of the extent of points by which an x0 may err and its `smooth` way needs no random starts beside it."""
+COINCIDENT, AWAY = 1e-3, 1e4
+"""Shares of the median distance of nodes from their middle below which two coincide and beyond which one is lost."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 COVARIANCE_NODES = 1000
@@ -146,6 +148,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
     expected, notes = judged(problem, x, truth)
+    if np.isfinite(truth.cost) and not (status is Status.SOLVED and truth.remaining <= POSITION_TOLERANCE):
+        notes = (*notes, *_unsolved(problem, x, truth, status))
     return Solution(
         x=x,
         covariance=truth.covariance,
@@ -211,25 +215,34 @@ def _challenged(
     problem: Problem, backend: Backend, options: Options, first: SolverResult, whole: bool
 ) -> tuple[Problem, SolverResult]:
     """The result from a given x0; where the way from there was long and not `smooth`, or of points whose vectors are
-    not measured as a `whole`, the lower of it and that from where the measurements lead, which a note names."""
+    not measured as a `whole`, the lower of it and that from where the measurements lead, which a note names; elsewhere
+    that from mirror images and other windings, unless noise may decide between them."""
     system, record = sparse(problem), first.extras.get("record")
     if record is None:
         record = arrive(system, np.asarray(problem.x0), FIRST_STEPS, RACE_TOLERANCE, smooth=True).record
     cost = system.cost(first.x)
-    straight, sure = smooth(record), whole or bool(problem.poses)
-    near = not np.isfinite(cost) or (straight and sure) or record[0, 0] - cost <= RIVAL_COST
-    if near or first.iterations >= options.get("max_iterations", np.inf):
+    if not np.isfinite(cost) or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
-    astray = np.abs(first.x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(first.x, axis=0).max()
-    other = _measured(problem, first.x, bool(not whole and (astray or not straight)))
-    search, said, least = other.search, problem.search.notes, system.cost(np.asarray(other.x0))
-    search = search._replace(iterations=search.iterations + first.iterations)
-    if higher(cost, least):
-        note = f"x0 leads to a higher minimum, of cost {cost:.4g}: start {search.start!r} led here"
-        other = other.replace_unchecked(search=search._replace(notes=(*said, *search.notes, note)))
+    straight, search = smooth(record), problem.search
+    near = (straight and (whole or bool(problem.poses))) or record[0, 0] - cost <= RIVAL_COST
+    if near and (whole or search.start):
+        return problem, first
+    if near:
+        other, won = race(problem, {}, {}, reached=first.x)
+    else:
+        astray = np.abs(first.x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(first.x, axis=0).max()
+        other = _measured(problem, first.x, bool(not whole and (astray or not straight)))
+        won = other.search
+    saved = cost - (least := system.cost(np.asarray(other.x0)))
+    if higher(cost, least) and (not near or saved > RIVAL_COST):
+        won = won._replace(iterations=won.iterations + first.iterations)
+        note = f"x0 leads to a higher minimum, of cost {cost:.4g}: start {won.start!r} led here"
+        other = other.replace_unchecked(search=won._replace(notes=(*search.notes, *won.notes, note)))
         return other, backend.run(other, np.asarray(other.x0), options)
-    notes = reached_once([cost, least], cost) if higher(least, cost) else search.notes
-    return problem.replace_unchecked(search=problem.search._replace(notes=(*said, *notes))), first
+    notes = reached_once([cost, least], cost) if higher(least, cost) else won.notes
+    if higher(cost, least):
+        notes = (f"another minimum costs {saved:.3g} less: noise may decide between them",)
+    return problem.replace_unchecked(search=search._replace(notes=(*search.notes, *notes))), first
 
 
 def _measured(problem: Problem, end: Floats, draws: bool) -> Problem:
@@ -276,6 +289,29 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
     return Status.SOLVED if left <= max(DECREASE * max(truth.cost, 1.0), NEWTON_DECREASE * still) else Status.FAILED
 
 
+def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) -> list[str]:
+    """Why nodes x (n, ambient) are no minimum that stands: a node far away, two that coincide, a step that is left."""
+    at, notes = problem.space.position(x), list[str]()
+    off = np.linalg.norm(at - np.median(at, axis=0), axis=1)
+    extent, lost = float(np.median(off)), int((off * problem.movable.any(axis=1)).argmax())
+    if off[lost] > AWAY * extent > 0.0:
+        notes.append(f"{problem.names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby")
+    if status not in (Status.FAILED, Status.MAX_ITERATIONS):
+        return notes
+    for factor in problem.factors:
+        if factor.measurement.arity == 2 and {"angle", "distance"} & {*factor.measurement.components}:
+            gap = np.diff(at[factor.nodes][:, :, :2], axis=1)
+            close = np.linalg.norm(gap, axis=(1, 2)) < COINCIDENT * extent
+            pairs = [" and ".join(problem.names[k] for k in factor.nodes[row]) for row in np.flatnonzero(close)[:1]]
+            notes += [
+                f"{pair} nearly coincide, or differ in height alone: {factor.kind} has no derivative there"
+                for pair in pairs
+            ]
+    if np.isfinite(truth.remaining):
+        notes.append(f"another step would move a node by {truth.remaining:.2g} m or rad and save {truth.predicted:.2g}")
+    return notes
+
+
 def _raise(solution: Solution) -> None:
     if solution.status is not Status.RANK_DEFICIENT:
         raise SolveError(solution)
@@ -283,6 +319,8 @@ def _raise(solution: Solution) -> None:
     hint = "Add a position factor (a fix) to one of them, or more measurements between them."
     if rejected := [note for note in solution.notes if "rejects" in note]:
         hint = f"The {', the '.join(rejected)}: give a nearer x0 or a larger scale, or measure more."
+    if lost := [note for note in solution.notes if "fits no place" in note]:
+        hint = f"{lost[0]}: look for outliers."
     raise InputError(
         "problem",
         f"{len(solution.unobservable)} of {len(solution.names)} points can move freely ({shown})",

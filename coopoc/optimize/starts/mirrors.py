@@ -86,10 +86,11 @@ def bodies(problem: Problem, x: Floats) -> list[Ints]:
     [array([1])]
     """
     vague = RANGES + LEVEL * (problem.dimension == 3)
-    others = [f.nodes[f.informative] for f in problem.factors if f.kind not in vague]
-    part = parts(len(problem.names), *others)
     alone = (_accepted(problem, f, x) for f in problem.factors if f.nodes.shape[1] == 1)
-    held = np.concatenate([np.array(problem.fixed, np.int64), *alone])
+    held = np.unique(np.concatenate([np.array(problem.fixed, np.int64), *alone]))
+    if len(held) == len(x):
+        return []
+    part = parts(len(x), *(f.nodes[f.informative] for f in problem.factors if f.kind not in vague))
     return [np.flatnonzero(part == body) for body in np.setdiff1d(part, part[held])]
 
 
@@ -248,6 +249,8 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     >>> np.degrees(np.arctan2(y[:, 4], y[:, 2])).round() % 360
     array([  0., 120., 240.])
     """
+    if not any(f.measurement.compares_poses for f in problem.factors):
+        return
     edges, space, n = graph_of(problem).relative_pose, problem.space, len(x)
     if not len(edges):
         return
