@@ -1,11 +1,12 @@
 """Graphs that no file holds: kinds of problems that users bring, drawn anew for every seed.
 
-Run:  python benchmarks/unseen_graphs.py 1000 100     (small graphs of so many seeds from the first on, by `solve` and
-                                                      from 50 random starts each)
+Run:  python benchmarks/unseen_graphs.py 1000 100     (small graphs of so many seeds from the first on, by `solve`, and
+                                                      by GTSAM from the truth and from 50 random starts)
 """
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,10 +14,10 @@ from hard_graphs import worse_odometry
 
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.values import to_orientation
-from coopoc.optimize import solve
-from coopoc.optimize.algebra.sparse import sparse
-from coopoc.optimize.descent.levenberg_marquardt import arrive
+from coopoc.optimize import Solution, solve
+from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.graph_problems import from_graph
+from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import exp
 
 
@@ -368,34 +369,43 @@ def ranged_drives(seed: int) -> Graph:
     return w.graph(relative_pose=w.relative(w.chain(), drift, 0.5 * drift), ranges=w.ranged(pairs, noise))
 
 
-def restarted(graph: Graph, restarts: int = 50, seed: int = 0) -> tuple[float, float, tuple[str, ...]]:
-    """The cost of `solve` from the automatic start, the least of descents from random starts, and the notes."""
-    problem = from_graph(graph)
-    found = solve(problem, throw=False)
-    rng, system, space, x0 = np.random.default_rng(seed), sparse(problem), problem.space, np.asarray(problem.x0)
-    wide, costs = 2.0 * np.ptp(graph.position, axis=0).max(), list[float]()
-    for k in range(restarts):
-        x = x0.copy()
-        if k % 2:  # robots where odometry leads, and only landmarks anywhere
-            rows = np.flatnonzero(~graph.is_pose)
-            x[rows, : graph.dimension] = rng.uniform(-wide, wide, (len(rows), graph.dimension))
-        else:
-            turned = exp(np.pi * rng.normal(size=(len(x), 1 if graph.dimension == 2 else 3)))
-            x = space.join(rng.uniform(-wide, wide, (len(x), graph.dimension)), turned)
-            x[list(problem.fixed)] = x0[list(problem.fixed)]
-        costs.append(system.cost(arrive(system, x, 200, 1e-8).x))
-    return found.cost, min(costs), found.notes
+def restarted(graph: Graph, restarts: int = 50, seed: int = 0) -> tuple[list[Solution], float]:
+    """Answers from the automatic start and from an x0 in the truth, and the least cost that GTSAM's own
+    Levenberg-Marquardt reaches from the truth and from random starts."""
+    import gtsam
+
+    problem, truth = from_graph(graph), np.asarray(from_graph(graph, start="file").x0)
+    answers = [solve(p, throw=False) for p in (problem, problem.replace_unchecked(x0=truth, search=Search()))]
+    rng, space, posed, starts = np.random.default_rng(seed), problem.space, which_turn(problem), [truth]
+    wide, points, still = np.ptp(graph.position, axis=0).max(), ~graph.is_pose, list(problem.fixed)
+    for k in range(restarts):  # landmarks anywhere where odometry leads or beside the truth, or all anywhere
+        turned = exp(np.pi * rng.normal(size=(len(truth), 1 if graph.dimension == 2 else 3)))
+        x = space.join(rng.uniform(-wide, wide, (len(truth), graph.dimension)), turned)
+        if k % 3:
+            x = np.where(points[:, None], x, (truth, np.asarray(problem.x0))[k % 3 - 1])
+        x[still] = truth[still]
+        starts.append(x)
+    native, params, costs = graph_of(problem, forms(problem)), gtsam.LevenbergMarquardtParams(), [np.inf]
+    params.setRelativeErrorTol(1e-8)
+    for x in starts:
+        optimizer = gtsam.LevenbergMarquardtOptimizer(native, values(space, posed, x), params)
+        with suppress(RuntimeError):  # a singular system
+            optimizer.optimize()
+            costs.append(optimizer.error())
+    return answers, min(costs)
 
 
 def main() -> None:
-    """Print how many small graphs end within 1e-4 of the best of random restarts, with and without a note."""
+    """Print how many answers to small graphs are within 1e-4 of the best of GTSAM's, with and without a note."""
     first, count = (int(each) for each in (*sys.argv[1:], "1000", "100")[:2])
-    rows = [(seed, *restarted(ranged_drives(seed))) for seed in range(first, first + count)]
-    worse = [row for row in rows if row[1] > row[2] * (1 + 1e-4) + 1e-9]
-    for seed, cost, best, notes in worse:
-        print(f"seed {seed}: {cost:.6g}, and {best:.6g} from a random start: {'; '.join(notes) or 'WITHOUT A NOTE'}")
-    silent = sum(not notes for *_, notes in worse)
-    print(f"{count - len(worse)} of {count} as good, {len(worse) - silent} worse with a note, {silent} without one")
+    worse, silent = 0, 0
+    for seed in range(first, first + count):
+        answers, best = restarted(ranged_drives(seed))
+        for start, found in zip(("auto", "truth"), answers, strict=True):
+            if found.cost > best * (1 + 1e-4) + 1e-9:
+                worse, silent = worse + 1, silent + (not found.notes)
+                print(f"seed {seed}, {start}: {found.cost:.6g}, GTSAM {best:.6g}: {found.notes or 'WITHOUT A NOTE'}")
+    print(f"{2 * count - worse} of {2 * count} as good, {worse - silent} worse with a note, {silent} without one")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Points and poses in one problem: derivatives against finite differences, minima against SciPy, files."""
 
+from dataclasses import replace
 from itertools import pairwise
 from time import perf_counter
 
@@ -16,6 +17,7 @@ from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.measurements import lookup
+from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import Space, exp, log
 
 
@@ -88,7 +90,7 @@ def test_a_turned_world_turns_the_estimate():
     problem = from_graph(graph, start="file")
     turn, shift, space = exp(np.array([0.7])), np.array([30.0, -4.0]), problem.space
     moved = space.join(problem.x0[:, :2] @ turn.T + shift, turn @ space.rotation(problem.x0))
-    there = Problem(problem.names, problem.factors, moved, dimension=2, poses=problem.poses, fixed=problem.fixed)
+    there = replace(problem, x0=moved, search=Search(x0=moved))
     a, b = solve(problem), solve(there)
     assert b.cost == pytest.approx(a.cost, abs=1e-12)
     assert b.position == pytest.approx(a.position @ turn.T + shift, abs=1e-6)
