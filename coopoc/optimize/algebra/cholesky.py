@@ -1,6 +1,7 @@
 """Sparse Cholesky factors of a Hessian with their analysis kept: solve, definiteness, marginals of any unknowns."""
 
 from contextlib import nullcontext
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,8 @@ class Cholesky:
 
         self._kernels = multifrontal  # to import it again at each call takes as long as to factor a star
         size = len(indptr) - 1
-        self._fronts = analysed(indptr, indices, np.arange(size) if group is None else group)
+        pattern = indptr, indices, np.arange(size) if group is None else group
+        self._fronts = analysed(*(part.astype(np.int64).tobytes() for part in pattern))
         self._rank = np.argsort(self._fronts.order)
         column = np.repeat(np.arange(size), np.diff(indptr))
         self._place = multifrontal.places(self._fronts, self._rank[indices], self._rank[column])
@@ -85,7 +87,7 @@ def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
     upper.sort_indices()
     if not (np.isfinite(upper.data).all() and (upper.diagonal() > 0).all()):
         return None
-    cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64), group)
+    cholesky = Cholesky(upper.indptr, upper.indices, group)
     return cholesky if cholesky.factor(upper.data) else None
 
 
@@ -101,8 +103,10 @@ def with_still(matrix: Any, added: Floats | Bools) -> Any:
     return matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
 
 
-def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
-    """Fronts of a pattern, its groups of unknowns in the order of approximate minimum degree or of nested dissection.
+@lru_cache(maxsize=3)
+def analysed(*pattern: bytes) -> Any:
+    """Fronts of a pattern of whole numbers (indptr, indices, group), its groups of unknowns in the order of approximate
+    minimum degree or of nested dissection; the last ones are kept, as rotations and positions are averaged alike.
 
     References:
         Amestoy, Davis, Duff, An approximate minimum degree ordering algorithm, SIAM J. Matrix Anal. 1996; Karypis,
@@ -112,6 +116,7 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
 
     from ...kernels.graphs.multifrontal import Fronts, postorder, supernodes
 
+    indptr, indices, group = (np.frombuffer(part, np.int64) for part in pattern)
     _, begin, width = np.unique(group, return_index=True, return_counts=True)
     u, n = len(group), len(width)
     of = csr_array((np.ones(u), np.repeat(np.arange(n), width), np.arange(u + 1)), shape=(u, n))

@@ -104,7 +104,7 @@ class Problem:
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
         for field in ("poses", "fixed"):
-            self.__dict__[field] = tuple(self.index(node) for node in getattr(self, field))
+            self.__dict__[field] = tuple(map(self.index, getattr(self, field)))
         self.__dict__["shown"] = self.index(self.shown) if self.names else 0
         self.__dict__["dimension"] = int(Space(self.dimension).dimension)  # 2 or 3
         items = (*self.factors, *self.constraints)
