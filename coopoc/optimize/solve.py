@@ -1,5 +1,6 @@
 """solve: a Problem and the name of a backend give a Solution, verified independently of the solver."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain, islice
 from typing import Any
@@ -289,27 +290,23 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
     return Status.SOLVED if left <= max(DECREASE * max(truth.cost, 1.0), NEWTON_DECREASE * still) else Status.FAILED
 
 
-def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) -> list[str]:
+def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) -> Iterator[str]:
     """Why nodes x (n, ambient) are no minimum that stands: a node far away, two that coincide, a step that is left."""
-    at, notes = problem.space.position(x), list[str]()
+    at, names = problem.space.position(x), problem.names
     off = np.linalg.norm(at - np.median(at, axis=0), axis=1)
-    extent, lost = float(np.median(off)), int((off * problem.movable.any(axis=1)).argmax())
+    extent, lost = np.median(off), (off * problem.movable.any(axis=1)).argmax()
     if off[lost] > AWAY * extent > 0.0:
-        notes.append(f"{problem.names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby")
-    if status not in (Status.FAILED, Status.MAX_ITERATIONS):
-        return notes
+        yield f"{names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby"
+    if status is Status.SOLVED:
+        return
     for factor in problem.factors:
         if factor.measurement.arity == 2 and {"angle", "distance"} & {*factor.measurement.components}:
-            gap = np.diff(at[factor.nodes][:, :, :2], axis=1)
-            close = np.linalg.norm(gap, axis=(1, 2)) < COINCIDENT * extent
-            pairs = [" and ".join(problem.names[k] for k in factor.nodes[row]) for row in np.flatnonzero(close)[:1]]
-            notes += [
-                f"{pair} nearly coincide, or differ in height alone: {factor.kind} has no derivative there"
-                for pair in pairs
-            ]
-    if np.isfinite(truth.remaining):
-        notes.append(f"another step would move a node by {truth.remaining:.2g} m or rad and save {truth.predicted:.2g}")
-    return notes
+            gap = np.diff(at[factor.nodes][..., :2], axis=1)
+            for i, j in factor.nodes[np.linalg.norm(gap, axis=(1, 2)) < COINCIDENT * extent][:1]:
+                level = f"{names[i]} and {names[j]} nearly coincide, or differ in height alone"
+                yield f"{level}: {factor.kind} has no derivative there"
+    if status is Status.FAILED:
+        yield f"another step would move a node by {truth.remaining:.2g} m or rad and save {truth.predicted:.2g}"
 
 
 def _raise(solution: Solution) -> None:

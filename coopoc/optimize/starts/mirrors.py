@@ -11,7 +11,7 @@ from ...arrays import Bools, Floats, Ints
 from ..assess.assess import squared
 from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
-from ..model.space import exp, log, nearest_rotation
+from ..model.space import exp, log
 from .graph_starts import averaging, crossings, parts, position_variance, rotation_variance
 from .initial import graph_of
 
@@ -28,6 +28,10 @@ DOUBTED_COST, TRIED_COST = 10.0, 100.0
 and to be tried."""
 ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
+REGISTRATIONS, REGISTERED = 20, 1e-3
+"""Random places from which a body is registered, and steps; damping of these, as a share of the trace."""
+MOST_PLACES = 3
+"""That are tried of each body."""
 MOVED_NODES = 1800
 """Of the cycles together that are wound the other way round."""
 MIN_SAVING = 1e-6
@@ -140,44 +144,61 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     return mirrored
 
 
-def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
-    """Nodes (K, ambient) moved as a rigid body as near as possible to their image at the best-fit plane of places
-    (K, d), a level one where several fit, keeping their handedness."""
-    space, middle = problem.space, places.mean(axis=0)
-    gaps, at = places - middle, space.position(nodes)
-    normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, 0]
-    image = at - 2.0 * np.outer((at - middle) @ normal, normal)
-    turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
-    moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
-    return space.join(moved, turn @ space.rotation(nodes))
+def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, Floats]:
+    """Turns (S, d, d) and places (S, d) of the middle of a body, whose points `own` (K, d) range `places` (K, d), from
+    random ones by damped Gauss-Newton steps."""
+    rng, d, arms = np.random.default_rng(0), own.shape[1], own - own.mean(axis=0)
+    turn = exp(rng.uniform(-np.pi, np.pi, (REGISTRATIONS, 2 * d - 3)))
+    at = places.mean(axis=0) + distance.mean() * rng.normal(size=(REGISTRATIONS, d))
+    axes = np.cross(np.eye(3), np.eye(3)[:, None])[-(2 * d - 3) :, :d, :d]  # turning about each of them
+    for _ in range(REGISTRATIONS):
+        arm = arms @ np.swapaxes(turn, 1, 2)
+        gap = arm + at[:, None] - places
+        length = np.linalg.norm(gap, axis=2, keepdims=True) + BRIDGE
+        J = np.concatenate([gap, np.einsum("skd,ade,ske->ska", gap, axes, arm)], axis=2) / length
+        left, square = (length[..., 0] - distance)[..., None], np.swapaxes(J, 1, 2) @ J
+        square += REGISTERED * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(J.shape[2])
+        step = np.linalg.solve(square, np.swapaxes(J, 1, 2) @ left)[..., 0]
+        at, turn = at - step[:, :d], exp(-step[:, d:]) @ turn
+    return turn, at
 
 
 def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
-    """Other places of a body: it is reflected at the best-fit plane of what ranges it, and a point is put where its
-    spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image."""
+    """Other places of a body, where its ranges fit best, though what ranges it has yet to give way: those of a point
+    are its image at the best-fit plane of what ranges it, a level one where several fit, and where spheres cross."""
     space, x, inside = ranges.problem.space, ranges.x, np.isin(ranges.nodes, body)
     rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))  # to what is not of it
     own, other = ranges.nodes[rows][inside[rows]], ranges.nodes[rows][~inside[rows]]
     if len(rows) < 2 and not (len(rows) and space.dimension == 3):
         return []
     at, places, index = space.position(x[body]), space.position(x[other]), np.searchsorted(body, own)
-    least = ELSEWHERE_SHARE * ranges.distance[rows].mean()
+    distance, turned = ranges.distance[rows], space.rotation(x[body])
 
     def costs(at: Floats) -> Floats:
         """(C,) of places (C, K, d) of the body."""
         return ranges.cost(np.linalg.norm(at[:, index] - places, axis=2).T, rows)
 
-    def apart(a: Floats, b: Floats) -> Bools:
-        return np.asarray(np.linalg.norm(a - b, axis=-1).max(axis=-1) > least)
-
-    ends = [_mirrored(ranges.problem, x[body], places)]
-    if len(body) == 1 and len(rows) >= space.dimension:
-        met = np.concatenate([space.position(np.stack(ends)), crossings(places, ranges.distance[rows])[:, None]])
-        best = met[np.where(apart(met, at), costs(met), np.inf).argmin()]
-        ends += [space.join(best)] * bool(apart(best, met[0]))
-    moved = np.stack([space.position(end) for end in ends])
-    adds = costs(moved) - costs(at[None])
-    return [(add, end, body) for add, end, far in zip(adds.tolist(), ends, apart(moved, at), strict=True) if far]
+    if len(body) > 1:
+        turn, middle = registered(at[index], places, distance)
+        met = (at - at[index].mean(axis=0)) @ np.swapaxes(turn, 1, 2) + middle[:, None]
+        turned = turn[:, None] @ turned
+    else:
+        gaps = places - places.mean(axis=0)
+        normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, :1]
+        met = np.concatenate(
+            [
+                at - 2.0 * (at - places.mean(axis=0)) @ normal @ normal.T,
+                *[crossings(places, distance)] * (len(rows) >= space.dimension),
+            ]
+        )[:, None]
+        turned = np.broadcast_to(turned, (len(met), *turned.shape))
+    least, chosen = ELSEWHERE_SHARE * distance.mean(), [at]
+    adds, moves = costs(met) - costs(at[None]), list[Move]()
+    for k in adds.argsort().tolist():
+        if len(moves) < MOST_PLACES and all(np.linalg.norm(met[k] - y, axis=1).max() > least for y in chosen):
+            chosen.append(met[k])
+            moves.append((float(adds[k]), space.join(met[k], turned[k]), body))
+    return moves
 
 
 def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
