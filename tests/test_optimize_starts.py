@@ -184,7 +184,7 @@ def test_a_loss_rejects_what_least_squares_need_not():
 
 def test_small_drives_end_as_low_as_restarts_or_say_so():
     """Descents from random starts: benchmarks/unseen_graphs.py has fifty."""
-    for seed, most in ((1002, 40.0), (1018, 40.0), (5008, 32.1), (88044, 32.0), (95101, 43.0)):
+    for seed, most in ((1002, 40.0), (1018, 40.0), (5008, 32.1), (88044, 32.0), (95101, 43.0), (9132, 28.2)):
         found = solve(from_graph(ranged_drives(seed)), throw=False)
         assert found.cost < most or found.notes
 

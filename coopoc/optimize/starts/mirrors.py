@@ -11,7 +11,7 @@ from ...arrays import Bools, Floats, Ints
 from ..assess.assess import squared
 from ..model.factor import Factor, Loss, stacked
 from ..model.problem import Problem
-from ..model.space import exp, log
+from ..model.space import exp, log, nearest_rotation
 from .graph_starts import averaging, crossings, parts, position_variance, rotation_variance
 from .initial import graph_of
 
@@ -28,12 +28,11 @@ DOUBTED_COST, TRIED_COST = 10.0, 100.0
 and to be tried."""
 ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
-REGISTRATIONS, REGISTERED = 20, 1e-3
-"""Random places from which a body is registered, and steps; damping of these, as a share of the trace."""
-MOST_PLACES = 3
-"""That are tried of each body."""
+REGISTRATIONS, REGISTERED, MOST_PLACES = 20, 1e-3, 4
+"""Random places from which a body is registered, and steps; damping of these, as a share of the trace; other places of
+a body that are tried."""
 MOVED_NODES = 1800
-"""Of the cycles together that are wound the other way round."""
+"""Of the cycles together that are wound the other way round, and of bodies moved one at a time, whatever that adds."""
 MIN_SAVING = 1e-6
 """Share of the cost that a move must save."""
 BRIDGE = 1e-9
@@ -144,6 +143,18 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     return mirrored
 
 
+def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
+    """Nodes (K, ambient) moved as a rigid body as near as possible to their image at the best-fit plane of places
+    (K, d), a level one where several fit, keeping their handedness."""
+    space, middle = problem.space, places.mean(axis=0)
+    gaps, at = places - middle, space.position(nodes)
+    normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, 0]
+    image = at - 2.0 * np.outer((at - middle) @ normal, normal)
+    turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
+    moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
+    return space.join(moved, turn @ space.rotation(nodes))
+
+
 def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, Floats]:
     """Turns (S, d, d) and places (S, d) of the middle of a body, whose points `own` (K, d) range `places` (K, d), from
     random ones by damped Gauss-Newton steps."""
@@ -164,41 +175,37 @@ def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, F
 
 
 def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
-    """Other places of a body, where its ranges fit best, though what ranges it has yet to give way: those of a point
-    are its image at the best-fit plane of what ranges it, a level one where several fit, and where spheres cross."""
+    """Other places of a body: it is reflected at the best-fit plane of what ranges it, and put where its ranges fit
+    best, a point where its spheres cross: where what ranges it has yet to give way, these need not be the image."""
     space, x, inside = ranges.problem.space, ranges.x, np.isin(ranges.nodes, body)
     rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))  # to what is not of it
     own, other = ranges.nodes[rows][inside[rows]], ranges.nodes[rows][~inside[rows]]
     if len(rows) < 2 and not (len(rows) and space.dimension == 3):
         return []
     at, places, index = space.position(x[body]), space.position(x[other]), np.searchsorted(body, own)
-    distance, turned = ranges.distance[rows], space.rotation(x[body])
+    least = ELSEWHERE_SHARE * ranges.distance[rows].mean()
 
     def costs(at: Floats) -> Floats:
         """(C,) of places (C, K, d) of the body."""
         return ranges.cost(np.linalg.norm(at[:, index] - places, axis=2).T, rows)
 
-    if len(body) > 1:
-        turn, middle = registered(at[index], places, distance)
+    def apart(a: Floats, b: Floats) -> Bools:
+        return np.asarray(np.linalg.norm(a - b, axis=-1).max(axis=-1) > least)
+
+    ends = [_mirrored(ranges.problem, x[body], places)]
+    if len(body) == 1 and len(rows) >= space.dimension:
+        met = np.concatenate([space.position(np.stack(ends)), crossings(places, ranges.distance[rows])[:, None]])
+        best = met[np.where(apart(met, at), costs(met), np.inf).argmin()]
+        ends += [space.join(best)] * bool(apart(best, met[0]))
+    elif len(body) > 1:
+        turn, middle = registered(at[index], places, ranges.distance[rows])
         met = (at - at[index].mean(axis=0)) @ np.swapaxes(turn, 1, 2) + middle[:, None]
-        turned = turn[:, None] @ turned
-    else:
-        gaps = places - places.mean(axis=0)
-        normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, :1]
-        met = np.concatenate(
-            [
-                at - 2.0 * (at - places.mean(axis=0)) @ normal @ normal.T,
-                *[crossings(places, distance)] * (len(rows) >= space.dimension),
-            ]
-        )[:, None]
-        turned = np.broadcast_to(turned, (len(met), *turned.shape))
-    least, chosen = ELSEWHERE_SHARE * distance.mean(), [at]
-    adds, moves = costs(met) - costs(at[None]), list[Move]()
-    for k in adds.argsort().tolist():
-        if len(moves) < MOST_PLACES and all(np.linalg.norm(met[k] - y, axis=1).max() > least for y in chosen):
-            chosen.append(met[k])
-            moves.append((float(adds[k]), space.join(met[k], turned[k]), body))
-    return moves
+        for k in costs(met).argsort().tolist():
+            if len(ends) < MOST_PLACES and all(apart(met[k], space.position(end)) for end in (*ends, x[body])):
+                ends.append(space.join(met[k], turn[k] @ space.rotation(x[body])))
+    moved = np.stack([space.position(end) for end in ends])
+    adds = costs(moved) - costs(at[None])
+    return [(add, end, body) for add, end, far in zip(adds.tolist(), ends, apart(moved, at), strict=True) if far]
 
 
 def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
@@ -206,7 +213,8 @@ def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
     x, most = ranges.x, TRIED_COST * (1.0 + len(ranges.nodes) / len(ranges.x))
     near = [move for move in single if move[0] <= most][:MAX_DESCENTS]
     several = (combinations(near, size) for size in range(2, len(near) + 1))
-    together = chain(combinations(single if far else near, 1), *several)
+    alone = single if far else single[: max(len(near), MOVED_NODES // len(x))]
+    together = chain(combinations(alone, 1), *several)
     for chosen in islice(together, MAX_DESCENTS):
         y = x.copy()
         for _, there, body in chosen:
