@@ -16,7 +16,7 @@ from .assess.assess import Assessment, assess, is_constrained_minimum, judged, n
 from .backend import MAX_ITERATIONS, Backend, Options, SolverResult, require_backend
 from .descent.levenberg_marquardt import arrive
 from .graph_problems import started
-from .model.factor import fused
+from .model.factor import fused, stacked
 from .model.measurements import CONVERTED
 from .model.problem import Problem, Search
 from .robust.graduated import robust_start
@@ -299,12 +299,10 @@ def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) ->
         yield f"{names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby"
     if status is Status.SOLVED:
         return
-    for factor in problem.factors:
-        if factor.measurement.arity == 2 and {"angle", "distance"} & {*factor.measurement.components}:
-            gap = np.diff(at[factor.nodes][..., :2], axis=1)
-            for i, j in factor.nodes[np.linalg.norm(gap, axis=(1, 2)) < COINCIDENT * extent][:1]:
-                level = f"{names[i]} and {names[j]} nearly coincide, or differ in height alone"
-                yield f"{level}: {factor.kind} has no derivative there"
+    pairs = stacked((f.nodes for f in problem.factors if f.nodes.shape[1] == 2), 2)
+    gap = np.linalg.norm(np.diff(at[pairs][..., :2], axis=1), axis=(1, 2))
+    for i, j in pairs[gap < COINCIDENT * extent][:1]:
+        yield f"{names[i]} and {names[j]} nearly coincide, or differ in height alone: no direction has a derivative"
     if status is Status.FAILED:
         yield f"another step would move a node by {truth.remaining:.2g} m or rad and save {truth.predicted:.2g}"
 

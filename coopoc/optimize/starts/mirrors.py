@@ -28,9 +28,8 @@ DOUBTED_COST, TRIED_COST = 10.0, 100.0
 and to be tried."""
 ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
-REGISTRATIONS, REGISTERED, MOST_PLACES = 20, 1e-3, 4
-"""Random places from which a body is registered, and steps; damping of these, as a share of the trace; other places of
-a body that are tried."""
+REGISTERED, MOST_PLACES = 40, 4
+"""Random places from which a body is registered, and steps; other places of a body that are tried."""
 MOVED_NODES = 1800
 """Of the cycles together that are wound the other way round, and of bodies moved one at a time, whatever that adds."""
 MIN_SAVING = 1e-6
@@ -143,34 +142,21 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     return mirrored
 
 
-def _mirrored(problem: Problem, nodes: Floats, places: Floats) -> Floats:
-    """Nodes (K, ambient) moved as a rigid body as near as possible to their image at the best-fit plane of places
-    (K, d), a level one where several fit, keeping their handedness."""
-    space, middle = problem.space, places.mean(axis=0)
-    gaps, at = places - middle, space.position(nodes)
-    normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, 0]
-    image = at - 2.0 * np.outer((at - middle) @ normal, normal)
-    turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
-    moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
-    return space.join(moved, turn @ space.rotation(nodes))
-
-
 def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, Floats]:
     """Turns (S, d, d) and places (S, d) of the middle of a body, whose points `own` (K, d) range `places` (K, d), from
-    random ones by damped Gauss-Newton steps."""
-    rng, d, arms = np.random.default_rng(0), own.shape[1], own - own.mean(axis=0)
-    turn = exp(rng.uniform(-np.pi, np.pi, (REGISTRATIONS, 2 * d - 3)))
-    at = places.mean(axis=0) + distance.mean() * rng.normal(size=(REGISTRATIONS, d))
-    axes = np.cross(np.eye(3), np.eye(3)[:, None])[-(2 * d - 3) :, :d, :d]  # turning about each of them
-    for _ in range(REGISTRATIONS):
-        arm = arms @ np.swapaxes(turn, 1, 2)
-        gap = arm + at[:, None] - places
-        length = np.linalg.norm(gap, axis=2, keepdims=True) + BRIDGE
-        J = np.concatenate([gap, np.einsum("skd,ade,ske->ska", gap, axes, arm)], axis=2) / length
-        left, square = (length[..., 0] - distance)[..., None], np.swapaxes(J, 1, 2) @ J
-        square += REGISTERED * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(J.shape[2])
-        step = np.linalg.solve(square, np.swapaxes(J, 1, 2) @ left)[..., 0]
-        at, turn = at - step[:, :d], exp(-step[:, d:]) @ turn
+    random ones: points go to the nearest ones of their spheres, and the body follows.
+
+    References:
+        De Leeuw, Applications of convex analysis to multidimensional scaling, 1977 (majorization, which never rises).
+    """
+    rng, arms, d = np.random.default_rng(0), own - own.mean(axis=0), own.shape[1]
+    at = places.mean(axis=0) + distance.mean() * rng.normal(size=(REGISTERED, d))
+    turn = exp(np.pi * rng.normal(size=(REGISTERED, 2 * d - 3)))
+    for _ in range(REGISTERED):
+        gap = arms @ np.swapaxes(turn, 1, 2) + at[:, None] - places
+        to = places + distance[:, None] * gap / np.linalg.norm(gap, axis=2, keepdims=True)
+        at = to.mean(axis=1)
+        turn = nearest_rotation(np.swapaxes(to, 1, 2) @ arms)
     return turn, at
 
 
@@ -189,23 +175,24 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
         """(C,) of places (C, K, d) of the body."""
         return ranges.cost(np.linalg.norm(at[:, index] - places, axis=2).T, rows)
 
-    def apart(a: Floats, b: Floats) -> Bools:
-        return np.asarray(np.linalg.norm(a - b, axis=-1).max(axis=-1) > least)
-
-    ends = [_mirrored(ranges.problem, x[body], places)]
-    if len(body) == 1 and len(rows) >= space.dimension:
-        met = np.concatenate([space.position(np.stack(ends)), crossings(places, ranges.distance[rows])[:, None]])
-        best = met[np.where(apart(met, at), costs(met), np.inf).argmin()]
-        ends += [space.join(best)] * bool(apart(best, met[0]))
-    elif len(body) > 1:
-        turn, middle = registered(at[index], places, ranges.distance[rows])
-        met = (at - at[index].mean(axis=0)) @ np.swapaxes(turn, 1, 2) + middle[:, None]
-        for k in costs(met).argsort().tolist():
-            if len(ends) < MOST_PLACES and all(apart(met[k], space.position(end)) for end in (*ends, x[body])):
-                ends.append(space.join(met[k], turn[k] @ space.rotation(x[body])))
-    moved = np.stack([space.position(end) for end in ends])
-    adds = costs(moved) - costs(at[None])
-    return [(add, end, body) for add, end, far in zip(adds.tolist(), ends, apart(moved, at), strict=True) if far]
+    gaps, middle, distance = places - places.mean(axis=0), places.mean(axis=0), ranges.distance[rows]
+    normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, :1]
+    image = at - 2.0 * (at - middle) @ normal @ normal.T
+    turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))[None]
+    met = (at - at.mean(axis=0)) @ turn[0].T + image.mean(axis=0)[None, None]
+    if len(body) > 1:
+        more, to = registered(at[index], places, distance)
+        turn = np.concatenate([turn, more])
+        met = np.concatenate([met, (at - at[index].mean(axis=0)) @ np.swapaxes(more, 1, 2) + to[:, None]])
+    elif len(rows) >= space.dimension:
+        met = np.concatenate([met, crossings(places, distance)[:, None]])
+        turn = np.repeat(turn, len(met), axis=0)
+    chosen, adds = list[int](), costs(met) - costs(at[None])
+    for k in np.append(0, adds.argsort()).tolist():
+        others = np.concatenate([at[None], met[chosen]])
+        if len(chosen) < MOST_PLACES and np.linalg.norm(met[k] - others, axis=2).max(axis=1).min() > least:
+            chosen.append(k)
+    return [(float(adds[k]), space.join(met[k], turn[k] @ space.rotation(x[body])), body) for k in chosen]
 
 
 def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
