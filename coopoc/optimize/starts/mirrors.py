@@ -28,9 +28,9 @@ DOUBTED_COST, TRIED_COST = 10.0, 100.0
 and to be tried."""
 ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
-REGISTERED, MOST_PLACES = 40, 4
+REGISTERED, MOST_PLACES = 40, 3
 """Random places from which a body is registered, and steps; other places of a body that are tried."""
-MOVED_NODES = 1800
+MOVED_NODES = 4000
 """Of the cycles together that are wound the other way round, and of bodies moved one at a time, whatever that adds."""
 MIN_SAVING = 1e-6
 """Share of the cost that a move must save."""
@@ -195,12 +195,12 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
     return [(float(adds[k]), space.join(met[k], turn[k] @ space.rotation(x[body])), body) for k in chosen]
 
 
-def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
-    """Points (n, ambient) to descend from: one body at a time moved, and several together; `far`: any one."""
+def _moves(ranges: Ranges, single: list[Move]) -> Iterator[Floats]:
+    """Points (n, ambient) to descend from: one body at a time moved, and several together."""
     x, most = ranges.x, TRIED_COST * (1.0 + len(ranges.nodes) / len(ranges.x))
     near = [move for move in single if move[0] <= most][:MAX_DESCENTS]
     several = (combinations(near, size) for size in range(2, len(near) + 1))
-    alone = single if far else single[: max(len(near), MOVED_NODES // len(x))]
+    alone = single[: max(len(near), MOVED_NODES // len(x))]
     together = chain(combinations(alone, 1), *several)
     for chosen in islice(together, MAX_DESCENTS):
         y = x.copy()
@@ -209,9 +209,7 @@ def _moves(ranges: Ranges, single: list[Move], far: bool) -> Iterator[Floats]:
         yield y
 
 
-def across(
-    problem: Problem, x: Floats, descend: Descend, cost: Cost, far: bool = False
-) -> tuple[Floats, int, list[tuple[float, Floats]]]:
+def across(problem: Problem, x: Floats, descend: Descend, cost: Cost) -> tuple[Floats, int, list[tuple[float, Floats]]]:
     """The lowest end (n, ambient) of descents from x, from mirror images of what ranges alone place and from cycles
     that are wound the other way, how many moves led down, and the other ends with their costs.
 
@@ -220,7 +218,6 @@ def across(
         x: (n, ambient) a minimum.
         descend: from a point to a minimum.
         cost: of a point.
-        far: whether moves are tried that add much to the cost before the others have given way.
     """
     loose, least, count, ends = bodies(problem, x), cost(x), 0, list[tuple[float, Floats]]()
     if len(loose) == len(problem.names) or not any(f.kind in RANGES for f in problem.factors):  # nothing to mirror at
@@ -229,7 +226,7 @@ def across(
         ranges, ends = ranges_of(problem, x), []
         single = sorted((move for body in loose for move in _elsewhere(ranges, body)), key=lambda move: move[0])
         turns = islice(rewound(problem, x, DOUBTED_COST), min(MAX_DESCENTS, MOVED_NODES // len(x)))
-        for start in chain(_moves(ranges, single, far), turns):
+        for start in chain(_moves(ranges, single), turns):
             end = descend(start)
             if (now := cost(end)) < (1.0 - MIN_SAVING) * least - 1e-9:
                 x, least, count = end, now, count + 1

@@ -107,8 +107,7 @@ def race(
             x = descend(x, LATER_STEPS)
             y, ends = drawn(scattered(problem, x), x, landed, system.cost)
             name, x = (name if y is x else "drawn"), y
-        far = name not in straight and system.cost(x) > limit
-        x, moves, others = across(problem, x, landed, system.cost, far)
+        x, moves, others = across(problem, x, landed, system.cost)
         name, cost = name + ", moved" * (moves > 0), system.cost(x)
         costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
         ends += [*others, *((each, x) for each in minima)]
