@@ -1,8 +1,10 @@
 """Random factor graphs: robots that drive about with odometry, loops, landmarks and ranges, and stars."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 from unseen_graphs import joined, world
 
 from coopoc.formats.graph import Graph, PointEdges, RangeEdges
@@ -24,6 +26,16 @@ def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
     step = np.zeros(problem.movable.shape)
     step[problem.movable] = v
     return problem.space.retract(x, step)
+
+
+def scipys(problem: Problem, start: np.ndarray, **options: Any) -> Any:
+    """SciPy's least squares over the numbers that can move, from nodes (n, ambient), with our derivatives."""
+    free = np.flatnonzero(problem.movable)
+
+    def at(v: np.ndarray) -> Any:
+        return problem.whiten(moved(problem, start, v))
+
+    return least_squares(lambda v: at(v)[0], np.zeros(len(free)), lambda v: at(v)[1][:, free].toarray(), **options)
 
 
 def random_graph(

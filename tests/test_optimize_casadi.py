@@ -6,8 +6,7 @@ import casadi
 import numpy as np
 import pytest
 from conftest import refused
-from random_graphs import star
-from scipy.optimize import least_squares
+from random_graphs import scipys, star
 from scipy.spatial.transform import Rotation
 
 from coopoc.optimize import Loss, Status, solve
@@ -25,14 +24,8 @@ def test_ranges_end_where_scipy_ends(start):
         found = solve(problem, "casadi")
         assert found.status is Status.SOLVED
         if start is None:
-            scipys = least_squares(
-                lambda v, p=problem: p.whiten(v.reshape(9, 3))[0],
-                initial_guess(problem).ravel(),
-                lambda v, p=problem: p.whiten(v.reshape(9, 3))[1].toarray(),
-                xtol=1e-15,
-                ftol=1e-15,
-            )
-            assert found.cost == pytest.approx(scipys.cost, rel=1e-9)
+            theirs = scipys(problem, initial_guess(problem), xtol=1e-15, ftol=1e-15)
+            assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
 
 
 @pytest.mark.parametrize(

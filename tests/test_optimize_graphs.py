@@ -11,8 +11,7 @@ import pytest
 from conftest import DIMENSIONS, measured, refused
 from hard_graphs import cropped
 from oracles.bayes_tree import bayes_tree_marginals
-from random_graphs import moved, random_drive, random_graph
-from scipy.optimize import least_squares
+from random_graphs import moved, random_drive, random_graph, scipys
 from scipy.sparse import csc_array
 from unseen_graphs import drone, range_aided, world
 
@@ -48,14 +47,7 @@ def test_a_newton_step_promises_the_square_of_its_decrement():
 def test_what_is_solved_is_scipys_minimum(seed):
     problem = from_graph(random_graph(seed, steps=30, ranges=60))
     found = solve(problem)
-    moving = np.flatnonzero(problem.movable)
-    theirs = least_squares(
-        lambda v: problem.whiten(moved(problem, found.x, v))[0],
-        np.zeros(len(moving)),
-        lambda v: problem.whiten(moved(problem, found.x, v))[1][:, moving].toarray(),
-        xtol=1e-14,
-        ftol=1e-15,
-    )
+    theirs = scipys(problem, found.x, xtol=1e-14, ftol=1e-15)
     assert found.status is Status.SOLVED
     assert theirs.cost == pytest.approx(found.cost, rel=1e-9)
     assert np.abs(theirs.x).max() < 1e-5
