@@ -117,7 +117,7 @@ def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | No
         if len(graph.ranges):
             late["eased"] = partial(eased, start=np.asarray(problem.x0))
         late["incremental"] = lambda _: incremental_start(graph, problem)
-    return race(problem, starts, late, "incremental" if len(graph.ranges) else "", draws, end)
+    return race(problem, starts, late, draws, end)
 
 
 def started(problem: Problem, end: Floats | None = None) -> Problem:

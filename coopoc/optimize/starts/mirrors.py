@@ -151,7 +151,7 @@ def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, F
     """
     rng, arms, d = np.random.default_rng(0), own - own.mean(axis=0), own.shape[1]
     at = places.mean(axis=0) + distance.mean() * rng.normal(size=(REGISTERED, d))
-    turn = exp(np.pi * rng.normal(size=(REGISTERED, 2 * d - 3)))
+    turn = nearest_rotation(rng.normal(size=(REGISTERED, d, d)))
     for _ in range(REGISTERED):
         gap = arms @ np.swapaxes(turn, 1, 2) + at[:, None] - places
         to = places + distance[:, None] * gap / np.linalg.norm(gap, axis=2, keepdims=True)

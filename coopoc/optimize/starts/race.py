@@ -43,7 +43,6 @@ def race(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
-    grown: str = "",
     draws: bool = False,
     reached: Floats | None = None,
 ) -> tuple[Problem, Search]:
@@ -60,7 +59,6 @@ def race(
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
         late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
-        grown: which of the late starts is tried first where no other went straight.
         draws: whether points and bodies are started from random places, too.
         reached: (n, ambient) the end of the descent from an x0, which competes.
     """
@@ -128,10 +126,10 @@ def race(
                 name, x = next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost)
                 return ended(name, x, True)
             straight |= {name} if end.converged else set()
-    if grown in late and not straight and least_of_all() > NEAR_COST * limit:
-        y = follow(grown, np.asarray(problem.x0))
+    if "eased" in late and not straight and least_of_all() > NEAR_COST * limit:  # with ranges it grows first
+        y = follow("incremental", np.asarray(problem.x0))
         if explained(y):
-            return ended(grown, y)
+            return ended("incremental", y)
     for name in rough:
         attempt(name, tried[name][1], FIRST_STEPS)
     least = least_of_all()
