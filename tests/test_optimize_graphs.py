@@ -228,8 +228,9 @@ def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated
     mean, variance = expected(problem, free)
     assert found.cost > mean + 5 * np.sqrt(variance)
     assert found.extras["start"] == "odometry"
-    assert found.extras["start_iterations"] <= 12
-    assert found.cost == pytest.approx(solve(from_graph(graph, start="incremental")).cost, rel=1e-9)
+    grown = solve(from_graph(graph, start="incremental"))
+    assert found.extras["start_iterations"] < grown.extras["start_iterations"]
+    assert found.cost == pytest.approx(grown.cost, rel=1e-9)
 
 
 def test_ranges_of_zero_and_ends_in_one_place_are_taken():

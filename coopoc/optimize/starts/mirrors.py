@@ -30,7 +30,7 @@ ELSEWHERE_SHARE = 0.05
 """Share of its mean range by which a body must move to be elsewhere."""
 REGISTERED, MOST_PLACES = 40, 3
 """Random places from which a body is registered, and steps; other places of a body that are tried."""
-MOVED_NODES = 4000
+MOVED_NODES = 1800
 """Of the cycles together that are wound the other way round, and of bodies moved one at a time, whatever that adds."""
 MIN_SAVING = 1e-6
 """Share of the cost that a move must save."""
