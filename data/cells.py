@@ -5,11 +5,12 @@ index of a frame is the row in the file, from 1, so that an error names it whate
 """
 
 import csv
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -80,25 +81,66 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
 def _read_parquet(path: Path) -> "pd.DataFrame":
     """The table without the index that pandas numbers rows with, words as objects.
 
-    A column, a list or a word that is the same throughout takes no room in the file: numbers and packed words are
-    counted in its metadata, and each word is read once, however often it stands.
+    A column, a list or a word that is the same throughout takes no room in the file, and what the footer says of sizes
+    may be false (some of it makes Arrow abort): they are counted in the headers of the pages, and each word is read
+    once, however often it stands.
     """
-    from pyarrow.parquet import read_metadata, read_table
-
-    size = read_metadata(path)
-    chunks = [size.row_group(g).column(c) for g in range(size.num_row_groups) for c in range(size.num_columns)]
+    from pyarrow.parquet import read_table
 
     def within(count: int) -> None:
         if count > LARGEST_TABLE:
             allowed = f"must hold at most {8 * LARGEST_TABLE} bytes when it is unpacked"
-            raise InputError(path.name, f"{size.num_rows} rows, {8 * count} bytes", allowed, "Split the drive.")
+            raise InputError(path.name, f"{rows} rows, {8 * count} bytes", allowed, "Split the drive.")
 
-    within(max(sum(each.num_values for each in chunks), sum(each.total_uncompressed_size for each in chunks) // 8))
-    table = read_table(path, read_dictionary=[each.path_in_schema for each in chunks])
+    with path.open("rb") as file:
+        file.seek(-8, os.SEEK_END)
+        file.seek(-8 - int.from_bytes(file.read(4), "little"), os.SEEK_END)
+        footer = _thrift(file)
+        rows, chunks = footer[3], [chunk[3] for group in footer[4] for chunk in group[1]]
+        within(sum(max(chunk[5], _unpacked(file, chunk)) for chunk in chunks))
+    table = read_table(path, read_dictionary=[b".".join(chunk[3]).decode() for chunk in chunks])
     frame: pd.DataFrame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
     words = frame.select_dtypes("category")
     within(len(frame) * max((len(str(word)) for name in words for word in words[name].cat.categories), default=0) // 8)
     return frame.astype(dict.fromkeys(words, object))
+
+
+def _unpacked(file: BinaryIO, chunk: Any) -> int:
+    """Numbers of 8 bytes that the pages of a column chunk unpack to, by their own headers."""
+    count, at = 0, min(chunk[9], chunk.get(11) or chunk[9])
+    end = at + chunk[7]
+    while at < end:
+        file.seek(at)
+        page = _thrift(file)
+        count += max(page[2] // 8, *(page[kind][1] for kind in (5, 7, 8) if kind in page), 0)
+        at = file.tell() + page[3]
+    return count
+
+
+def _thrift(file: BinaryIO, kind: int = 12) -> Any:
+    """Magnitude, bytes, list or struct (fields by number) in Thrift's compact protocol, as Parquet writes them."""
+
+    def integer() -> int:
+        value = 0
+        for shift in range(0, 70, 7):
+            byte = file.read(1)[0]
+            value |= (byte & 127) << shift
+            if byte < 128:
+                break
+        return value
+
+    if kind == 8:
+        return file.read(integer())
+    if kind == 9:
+        head = file.read(1)[0]
+        return [_thrift(file, head & 15) for _ in range(head >> 4 if head < 240 else integer())]
+    if kind != 12:
+        return integer() // 2
+    fields, field = dict[int, Any](), 0
+    while head := file.read(1)[0]:
+        field = field + (head >> 4) if head >> 4 else integer() // 2
+        fields[field] = head & 15 if head & 15 < 3 else _thrift(file, head & 15)
+    return fields
 
 
 def headers(path: Path) -> list[str]:

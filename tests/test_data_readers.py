@@ -10,6 +10,7 @@ import pymap3d
 import pytest
 from conftest import measured, refused
 from numpy.testing import assert_allclose, assert_array_equal
+from pyarrow.parquet import read_metadata
 
 import coopoc as co
 from coopoc.data.assemble import interpolate
@@ -354,10 +355,18 @@ def test_a_damaged_array_of_comma2k19_is_named(tmp_path, name, wrong, thing):
 
 
 @pytest.mark.parametrize("x", [np.zeros(200), [[0.0] * 200], ["a" * 2000], ["a" * 900] * 2], ids=range(4))
-def test_a_parquet_table_is_refused_by_its_metadata(tmp_path, monkeypatch, x):
-    """Numbers in rows or in a list that are alike take 3 kB, and so does a word; the last is known once it is read."""
+def test_a_parquet_table_is_refused_by_its_pages(tmp_path, monkeypatch, x):
+    """Numbers in rows or in a list that are alike take 3 kB, and so does a word; the last is known once it is read. A
+    footer that says 1 of each size changes nothing, nor one whose levels contradict, where Arrow's metadata abort."""
     pd.DataFrame({"x": x}).to_parquet(tmp_path / "a.parquet")
+    chunk, whole = read_metadata(tmp_path / "a.parquet").row_group(0).column(0), (tmp_path / "a.parquet").read_bytes()
+    start = -8 - int.from_bytes(whole[-8:-4], "little")
+    footer = whole[start:].replace(b"\x25\x02\x18\x01x", b"\x25\x00\x18\x01x", -1 if len(x) > 2 else 0)
+    for size in {chunk.num_values, chunk.total_uncompressed_size, len(x)} - {*range(64)}:
+        footer = footer.replace(bytes([2 * size % 128 | 128, size >> 6]), b"\x82\x00")
     monkeypatch.setattr("coopoc.data.cells.LARGEST_TABLE", 150)
     monkeypatch.setattr(pd.DataFrame, "astype", None)
-    with refused("a.parquet = .* bytes: must hold at most 1200 bytes"):
-        load_fleet(tmp_path / "a.parquet")
+    for lies in (whole[start:], footer):
+        (tmp_path / "a.parquet").write_bytes(whole[:start] + lies)
+        with refused("a.parquet = .* bytes: must hold at most 1200 bytes"):
+            load_fleet(tmp_path / "a.parquet")
