@@ -97,8 +97,8 @@ def assemble(
     for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
         raise InputError(
             f"{file}: vehicle {ids[k]}",
-            f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row",
-            "must be there at instants in a row",
+            f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two consecutive",
+            "must be present at consecutive instants",
             "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out.",
         )
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
@@ -131,7 +131,7 @@ def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: s
         raise InputError(
             f"{file}: velocity",
             f"none for {ids[alone[0, 1]]} at t = {t[alone[0, 0]]:g} s",
-            "needs two instants in a row to be derived",
+            "needs two consecutive instants to be derived",
             "Add the columns vx, vy, vz, or leave out the vehicle's single instants.",
         )
     return u

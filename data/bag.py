@@ -87,7 +87,7 @@ def read_bag(
         raise InputError(
             "columns, kinds",
             path.name,
-            "are of tables, and this is a bag",
+            "apply to tables, and this is a bag",
             'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".',
         )
     try:
@@ -137,7 +137,7 @@ def read_bag(
     if behind:
         other = "received" if stamps == "header" else "header"
         spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"
-        summary.assume(f"times are those of stamps={stamps}; headers are {spread} (stamps={other}: by the other)")
+        summary.assume(f"times are by stamps={stamps}; headers are {spread} (stamps={other} takes the other)")
     if all(rows["true"].all() for rows in parts.values()):
         types = ", ".join(name.rpartition("/")[2] for name in READ)
         raise InputError(path.name, "0 messages", f"must hold {types}", "Check the topics with: ros2 bag info.")
@@ -179,7 +179,7 @@ def _by_number(frame: pd.DataFrame, summary: Summary) -> pd.DataFrame:
         name: numbered[number] for name in sorted(ends) if (number := re.sub(r"\D", "", name)) in numbered and number
     }
     if same:
-        summary.assume(f"ends of ranges by their numbers: {', '.join(f'{a} is {b}' for a, b in same.items())}")
+        summary.assume(f"ranges name vehicles by their number: {', '.join(f'{a} is {b}' for a, b in same.items())}")
     return frame.replace({"vehicle": same, "partner": same})
 
 
@@ -194,7 +194,7 @@ def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> p
     elif "min_range" in topic:
         most = topic["max_range"].where(topic["max_range"] > 0, np.finfo(float).max)  # 0: not stated
         valid = topic["range"].between(topic["min_range"].clip(0), most)
-        reason = "ranges outside of what the sensor says it can measure"
+        reason = "ranges outside the sensor's stated limits"
     summary.refuse(reason, int((~valid).sum()), where)
     topic = topic[valid]
     made = {"t": topic["t"]} | {kind: topic[name] for name, kind in FIELDS.items() if name in topic}

@@ -258,7 +258,7 @@ def named_columns(
             raise InputError(
                 f"{file}: columns[{key!r}]",
                 repr(columns[key]),
-                f"is not the only column {key} then: the file has one of that name",
+                f"would be a second column {key}: the file has one of that name",
                 "Rename or remove one of them.",
             )
     for key in needed:

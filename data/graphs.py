@@ -66,5 +66,5 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
         at = {"t": graph.stamps[rows], "x": position[rows, 0], "y": position[rows, 1]}
         parts.append({"vehicle": who[rows], **at, **more})
     others = (graph.relative_point, graph.pose_prior, graph.point_prior, edges)
-    summary.refuse("points and poses that were measured, but odometry", sum(map(len, others)) - used)
+    summary.refuse("measured points and poses other than odometry", sum(map(len, others)) - used)
     return of_kinds(pd.concat(map(pd.DataFrame, parts), ignore_index=True), path.name)

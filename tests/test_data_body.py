@@ -138,7 +138,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
     log = co.read_log(tmp_path / "log.csv", frame="body")
     columns = [log.recording.ids.index(name) for name in CARS]
     assert np.isnan(log.recording.gnss[:, :, columns]).all()
-    assert log.summary.refused["messages of landmarks, and what they measured but ranges to vehicles"][0] == 1
+    assert log.summary.refused["messages of landmarks, and their measurements other than ranges to vehicles"][0] == 1
     assert log.summary.refused["world velocities in body frames"][0] == 1
     begin = np.full((4, 4), np.nan)
     begin[columns] = [[*place[0], 0.0, heading[0]] for place, heading, _, _ in drives().values()]

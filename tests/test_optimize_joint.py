@@ -61,7 +61,7 @@ def test_a_point_on_the_line_of_its_anchors_has_the_covariance_of_its_solution()
 
 def test_what_has_no_covariance_is_refused():
     problem = Problem("ab").add("displacement", ("a", "b"), [1, 0, 0], std=1.0)
-    with refused("must hold all nodes"):
+    with refused("must be observable"):
         joint_covariance(problem, solve(problem, throw=False), "ab")
     fixed = problem.add("position", "a", [0, 0, 0], std=1.0)
     with refused("constraints"):

@@ -241,7 +241,7 @@ def test_half_a_turn_is_told_from_places_that_coincide():
     one = Problem("a", poses=(0,), x0=[pose([0, 0, 0], [0, 0, 0])]).add(
         "pose", 0, pose([0, 0, 0], [0, np.pi, 0]), std=0.1
     )
-    with refused("a half a turn from what is measured"):
+    with refused("a half a turn from the measured rotation"):
         solve(one)
     assert solve(Problem("a", one.factors, poses=(0,))).cost < 1e-9
 

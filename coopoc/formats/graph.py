@@ -258,7 +258,7 @@ def check(graph: Graph, location: Location) -> None:
             _ends(graph, field, edges.nodes, location)
             _values(edges, field, location)
     fixed = graph.fixed
-    _refuse(location, "fixed", (fixed < 0) | (fixed >= n), fixed, f"must be in 0..{n - 1}", "Give places in names.")
+    _refuse(location, "fixed", (fixed < 0) | (fixed >= n), fixed, f"must be in 0..{n - 1}", "Give indices into names.")
 
 
 def _vertices(graph: Graph, location: Location) -> None:
@@ -282,7 +282,7 @@ def _vertices(graph: Graph, location: Location) -> None:
 
 def _ends(graph: Graph, field: str, nodes: Ints, location: Location) -> None:
     n = len(graph.names)
-    outside, hint = ((nodes < 0) | (nodes >= n)).any(axis=1), "Give places in names."
+    outside, hint = ((nodes < 0) | (nodes >= n)).any(axis=1), "Give indices into names."
     _refuse(location, field, outside, nodes, f"must be in 0..{n - 1}", hint, "vertices ")
     for end, role in enumerate(ENDS[field]):
         if role != "any":

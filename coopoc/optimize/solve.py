@@ -264,7 +264,7 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
     for item, nodes in lost:
         pair = " and ".join(problem.names[n] for n in nodes[0])
         if item.measurement.compares_poses:
-            what, hint = f"{pair} half a turn from what is measured", "Give an x0 that is turned less."
+            what, hint = f"{pair} half a turn from the measured rotation", "Give an x0 nearer to the measured rotation."
         else:
             what, hint = f"{pair} coincide, or differ in height alone", "Give an x0 that keeps them apart."
         raise InputError("x0", what, f"leaves {item.kind} without a direction", hint)

@@ -231,8 +231,6 @@ def pivot(
     in_all = [f"{words(name)}: {label(name, summary[name].iloc[0])}." for name in same]  # and no column
     if intervals:
         in_all.append("In brackets: 95 % interval.")
-    if best:
-        in_all.append("Bold: the best, and those whose difference from it noise may explain.")
     caption = " ".join([caption or f"{words(value)}.", *in_all])
     down = [name for name in down if name not in same] or down[:1]
     titles, of = dict[str, None](), dict[tuple[Entry, ...], dict[str, Any]]()
@@ -269,7 +267,9 @@ def pivot(
             one, other = ({**(where or {}), **{k: each[k] for k in (*down, *across)}} for each in (first, row))
             if near and alike(results, one, other, value):
                 same_as_best.append((i, j))
-    return replace(made, alike=tuple(same_as_best))
+    made = replace(made, alike=tuple(same_as_best))
+    bold = " Bold: the best, and those whose difference from it noise may explain." * bool(made._bold())
+    return replace(made, caption=caption + bold)
 
 
 def smooths(labels: Iterable[object]) -> bool:

@@ -155,7 +155,7 @@ class Recording:
             shape = gnss.shape[1:3] if plain(getattr(self, name)).size else (0,)
             values = checked(name, getattr(self, name), "(T, N) or (0,)", shape)
             wrong, allowed = ~((values >= least) & (values < np.inf)), f"must be {'>' * stated or '>='} 0 and finite"
-            refuse(name, values, wrong, allowed, f"{stated} is as `sensors` says.")
+            refuse(name, values, wrong, allowed, f"{stated} means as `sensors` states.")
             self.__dict__[name] = values
         self.sensors.check_assumed()
         self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))

@@ -59,20 +59,20 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
     clock = rows.groupby("file", sort=False)["t"].transform(of_clock_face)
     if not clock.equals(rows["t"]):
         rows = rows.assign(t=clock)
-        summary.assume("stamps are hours, minutes and seconds, hhmmss.ss: no number is of the seconds 60 to 99")
+        summary.assume("stamps are read as hhmmss.ss: none has minutes or seconds of 60 to 99")
     t, last = rows["t"], rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
     back = t < last
     for period in PERIODS:
         part = (t - last[(last - t).between(0.9 * period, 1.1 * period)].max()) / period + 1.0
         if part.between(-0.25, 1.25)[t.notna()].all() and not part.between(0.25, 0.75).any():
-            summary.assume(f"stamps begin anew after {period:.10g} s: those before half of it count on")
+            summary.assume(f"stamps wrap around after {period:.10g} s: those of its first half come later")
             early = {name: rows[name].mask(part < 0.5, rows[name] + period) for name in ("t", "arrival")}
             return rows.assign(**early)
     if 0 < back.mean() < DISORDER_SHARE:
         who = ", ".join(rows["vehicle"][back].unique())
         summary.assume(
-            f"stamps of {who} go back (first: {row_of(rows[back])}), as a clock that was set, or a logger that began "
-            "anew, whose parts are logs of their own; rows are in their order"
+            f"stamps of {who} go back (first: {row_of(rows[back])}): was a clock set? If the logger restarted, "
+            "give each part a log of its own. Rows are sorted by time"
         )
     return rows
 
@@ -193,7 +193,7 @@ def _by_attitude(rows: Rows, summary: Summary) -> Rows:
     table.loc[unit, "qw"] = heading[unit]
     made = table.stack().reindex(index).to_numpy()
     known = np.isfinite(made)
-    summary.refuse("numbers of quaternions that lack one, or are not of unit length", rows[turns & ~known])
+    summary.refuse("quaternions that lack a component or are not of unit length", rows[turns & ~known])
     for name in rows["vehicle"][turns].unique():
         summary.assume("quaternions turn from the body (x forward, y left, z up) to the local frame: those of {}", name)
     rows = rows.assign(value=np.where(known, made, rows["value"]), kind=rows["kind"].replace("qw", "heading"))
@@ -267,15 +267,17 @@ def assumed(
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
     elif derived and "bearing" in used:
         noise["heading_std"] = derived
-        summary.assume(f"{derived:.2g} rad as the noise of headings that are derived, by which bearings are turned")
+        summary.assume(f"{derived:.2g} rad as the noise of derived headings, which rotate bearings")
     if climbs > 0.0:
         noise["climb_std"] = np.sqrt(climbs / dt)
-        summary.assume(f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, as fixes show: no vz was measured")
+        summary.assume(
+            f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, estimated from fixes: no vz was logged"
+        )
     ratio, moving = 0.0, [member for member in members if not member.stands]
     if moving and all(member.wander.any() for member in moving):
         floor = max(np.sqrt(drifts / dt), rare * of(*MOTION, default=base.velocity_floor, unit="m/s"))
         summary.assume(
-            f"{floor:.2g} m/s or more as the noise of a velocity, as the fixes of what has none, or no heading, show it"
+            f"{floor:.2g} m/s or more as the noise of velocities from fixes, where no velocity or heading was logged"
         )
         if len(summary.shown) == len(moving):
             noise["velocity_reading"] = "fixes"
@@ -288,9 +290,7 @@ def assumed(
             heading = float(np.sqrt(square["heading"]))  # whose error, v^2 s_h^2 across, lasts until the next one
             across = (only(rows, "speed")["value"] ** 2).mean() * heading**2 * _apart(rows, ["heading"], dt)
             floor = max(floor, float(np.sqrt((floor**2 + across) / 2)))
-            summary.assume(
-                f"{floor:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds"
-            )
+            summary.assume(f"{floor:.2g} m/s as the noise of velocities, with that of the headings that rotate speeds")
     return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
 
 

@@ -113,7 +113,7 @@ def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Row
     own, theirs = (rows[who].isin(landmarks) for who in ("vehicle", "partner"))
     turned = own & ~theirs & (rows["kind"] == "range")
     left = own & ~turned & in_group(rows, "relative", "message")
-    summary.refuse("messages of landmarks, and what they measured but ranges to vehicles", rows[left])
+    summary.refuse("messages of landmarks, and their measurements other than ranges to vehicles", rows[left])
     swapped = {"vehicle": rows["partner"], "partner": rows["vehicle"]}
     return rows.assign(**{who: rows[who].where(~turned, other) for who, other in swapped.items()})[~left]
 
@@ -156,8 +156,8 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
     std = stated_std(fixes, "x", "y")
     moved, vague, full = _to_step(table, members, steps, NEAR_STDS * (std if std > 0.0 else Sensors().gnss_std[0]))
-    summary.refuse("relative measurements off the steps, of what is too near", table[vague])
-    summary.refuse("relative measurements at the most that is measured, of what is further away", table[full])
+    summary.refuse("relative measurements between steps, of partners too near to move them to one", table[vague])
+    summary.refuse("relative measurements at their maximum, of partners farther away", table[full])
     kept: pd.DataFrame = table.assign(value=moved).loc[~vague & ~full, [*LINK_COLUMNS, "component", "value"]]
     for word, number in zip(words, np.bincount(kept["component"], minlength=3).tolist(), strict=True):
         summary.count(word, number)

@@ -41,11 +41,13 @@ UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
 CLIMBS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """s, or halves of an interval of fixes that is longer, in which heights change where a road climbs."""
-COURSE = "the heading of {} is the course of the {}, carried on by yaw rates if logged: no vehicle slips or reverses"
-ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
-HOLDS = "fixes that stay while the odometry moves on"
-OTHER_RATES = "yaw rates are rad/s anticlockwise, but fixes of {} turn otherwise: scale=yaw_rate:"
-NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
+COURSE = (
+    "the heading of {} is the course of the {}, between them by yaw rates if logged: assumes no slipping or reversing"
+)
+ARM = "fixes are moved from the antenna to the reference point, of {}; assumes no slipping or reversing"
+HOLDS = "fixes that repeat while the odometry moves"
+OTHER_RATES = "yaw rates are read as rad/s anticlockwise, which fixes of {} contradict: scale=yaw_rate:"
+NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is estimated from its past fixes"
 
 VELOCITIES = ("vx", "vy", "vz")
 

@@ -379,14 +379,14 @@ def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
         raise InputError(
             "fixes, odometry",
             "none",
-            "must be there: a pose is carried on by odometry",
+            "are needed: a pose filter predicts by odometry",
             f"Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks. {summary.unread}".rstrip(),
         )
     hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once; where ranges to "
     raise InputError(
         "fixes",
         f"of {', '.join(sorted(names))}, not of {', '.join(sorted(moving))}" if names else "none",
-        "must be there: a position in the local frame starts from one",
+        "needs at least one to place it in the local frame",
         f'{hint}anchors place it, read frame="body". Where files are named after sensors, give them a column vehicle, '
         f"or a folder that is named after it. {summary.unread}".rstrip(),
     )
@@ -458,7 +458,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
     heights = pd.DataFrame(recording.gnss[0, ..., 2])
     heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")
     if axes == 2 and heights.abs().gt(0.0).to_numpy().any():
-        summary.assume("the truth has no heights: means of the fixes' over 20 s stand for them, and for their errors")
+        summary.assume("the truth has no heights: 20 s means of the fixes' heights replace them, and hide their errors")
     poses = np.full((len(steps), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
         own_rows = rows[rows["vehicle"] == vehicle]
@@ -471,7 +471,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
                 out[:] = interpolate(t - steps[0], value, steps - steps[0], gap)
                 if np.median(np.diff(t)) > SPARSE_SECONDS and len(t) > 2:
                     summary.assume(
-                        f"a seldom truth counts within {SPARSE_SECONDS:g} s, on a curve through all (Akima's)"
+                        f"a low-rate truth counts within {SPARSE_SECONDS:g} s of its samples, by Akima's interpolation"
                     )
                     near = covered(t, steps, 0.0, SPARSE_SECONDS)[:, None] & np.isfinite(out)
                     out[:] = np.where(near, Akima1DInterpolator(t - steps[0], value)(steps - steps[0]), np.nan)

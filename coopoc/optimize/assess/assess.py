@@ -478,13 +478,13 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     places = [problem.index(node) for node in (nodes if isinstance(nodes, str) else several(nodes))]
     if len(places) > len(problem.names):
         allowed = f"must name each of {len(problem.names)} nodes once"
-        raise InputError("nodes", f"{len(places)} nodes", allowed, "Leave out those that stand twice.")
+        raise InputError("nodes", f"{len(places)} nodes", allowed, "Name each node once.")
     dof, system = problem.space.dof, sparse(as_stated(problem))
     truth = assess(problem, x, covariance=False)
     model: Model = "newton" if truth.curved else "gauss-newton"
     if truth.unobservable or not system.cholesky.factor(system.quadratic(x, model)[2]):
-        hint = "Measure what is free: see solution.unobservable."
-        raise InputError("problem", repr(problem), "must hold all nodes", hint)
+        hint = "Add measurements of solution.unobservable."
+        raise InputError("problem", repr(problem), "must be observable", hint)
     wanted = system.entries.number[places].ravel()
     unit = (np.arange(system.size)[:, None] == wanted).astype(float)
     solved = columns_solved(system.cholesky, unit) if places else unit

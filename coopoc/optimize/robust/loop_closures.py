@@ -253,7 +253,7 @@ def predicted(marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats
     """
     problem, system = marked.problem, sparse(marked.reweigh(weight, x))
     if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
-        raise InputError("candidates", repr(problem), "must leave known inliers that hold all nodes", HINT)
+        raise InputError("candidates", repr(problem), "must leave known inliers that determine all nodes", HINT)
     distance, volume = np.zeros(len(marked.row)), np.zeros(len(marked.row))
     for k in np.unique(marked.factor):
         here = marked.factor == k
