@@ -95,9 +95,18 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
     with path.open("rb") as file:
         file.seek(-8, os.SEEK_END)
         file.seek(-8 - int.from_bytes(file.read(4), "little"), os.SEEK_END)
-        footer = _thrift(file)
+        footer, count = _thrift(file), 0
         rows, chunks = footer[3], [chunk[3] for group in footer[4] for chunk in group[1]]
-        within(sum(max(chunk[5], _unpacked(file, chunk)) for chunk in chunks))
+        within(sum(chunk[5] for chunk in chunks))
+        for chunk in chunks:
+            at = min(chunk[9], chunk.get(11) or chunk[9])
+            end = at + chunk[7]
+            while at < end:
+                file.seek(at)
+                page = _thrift(file)
+                count += max(page[2] // 8, *(page[kind][1] for kind in {5, 7, 8} & page.keys()), 0)
+                at = file.tell() + page[3]
+        within(count)
     table = read_table(path, read_dictionary=[b".".join(chunk[3]).decode() for chunk in chunks])
     frame: pd.DataFrame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
     words = frame.select_dtypes("category")
@@ -105,41 +114,24 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
     return frame.astype(dict.fromkeys(words, object))
 
 
-def _unpacked(file: BinaryIO, chunk: Any) -> int:
-    """Numbers of 8 bytes that the pages of a column chunk unpack to, by their own headers."""
-    count, at = 0, min(chunk[9], chunk.get(11) or chunk[9])
-    end = at + chunk[7]
-    while at < end:
-        file.seek(at)
-        page = _thrift(file)
-        count += max(page[2] // 8, *(page[kind][1] for kind in (5, 7, 8) if kind in page), 0)
-        at = file.tell() + page[3]
-    return count
-
-
 def _thrift(file: BinaryIO, kind: int = 12) -> Any:
     """Magnitude, bytes, list or struct (fields by number) in Thrift's compact protocol, as Parquet writes them."""
 
     def integer() -> int:
-        value = 0
-        for shift in range(0, 70, 7):
-            byte = file.read(1)[0]
-            value |= (byte & 127) << shift
-            if byte < 128:
-                break
-        return value
+        byte = file.read(1)[0]
+        return byte if byte < 128 else byte - 128 + 128 * integer()
 
     if kind == 8:
         return file.read(integer())
     if kind == 9:
         head = file.read(1)[0]
         return [_thrift(file, head & 15) for _ in range(head >> 4 if head < 240 else integer())]
-    if kind != 12:
+    if kind < 12:
         return integer() // 2
     fields, field = dict[int, Any](), 0
     while head := file.read(1)[0]:
         field = field + (head >> 4) if head >> 4 else integer() // 2
-        fields[field] = head & 15 if head & 15 < 3 else _thrift(file, head & 15)
+        fields[field] = head & 15 > 2 and _thrift(file, head & 15)  # a bool of a struct takes no byte
     return fields
 
 

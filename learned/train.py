@@ -177,8 +177,8 @@ def _fitted(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
 
 
 def _okf(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
-    training, validation = (_joined(data, part) for part in ("training", "validation"))
-    return Checkpoint(*fit_okf(training, validation, job.recipe.schedule.epochs, stage))
+    parts = _joined(data, "training"), _joined(data, "validation")
+    return Checkpoint(*fit_okf(*parts, job.recipe.schedule.epochs, stage))
 
 
 TRAINERS = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

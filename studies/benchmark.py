@@ -7,8 +7,9 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -201,10 +202,11 @@ def page(cards: Iterable[Params]) -> str:
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
     card_list = list(cards)
-    return "\n\n".join(markdown(rows) for rows in (_simulated(card_list), _logs(card_list)) if rows)
+    ordered = (sorted(rows, key=itemgetter(0)) for rows in (_simulated(card_list), _logs(card_list)) if rows)
+    return "\n\n".join(markdown([row for _, row in rows]) for rows in ordered)
 
 
-def _logs(cards: Sequence[Params]) -> list[Row]:
+def _logs(cards: Sequence[Params]) -> list[tuple[Any, Row]]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
     each = [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] not in TASK_NAMES]
     usual = {row["task"]: row for one, row in each if one == COMPARED_WITH}
@@ -219,10 +221,10 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))
-    return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
+    return rows
 
 
-def _simulated(cards: Sequence[Params]) -> list[Row]:
+def _simulated(cards: Sequence[Params]) -> list[tuple[Any, Row]]:
     rows = []
     for one in cards:
         cells = {row["task"]: row for row in one["tasks"] if row["task"] in TASK_NAMES}
@@ -235,7 +237,7 @@ def _simulated(cards: Sequence[Params]) -> list[Row]:
         shown |= {task: _cell(cells[task]) if task in cells else "" for task in TASK_NAMES}
         shown |= {"NEES inside": paper.get("nees_inside", ""), "B/s": paper.get("received_bytes_per_second", "")}
         rows.append((mean, shown | {"us/step": paper.get("microseconds_per_step", "")}))
-    return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
+    return rows
 
 
 def _cell(row: Params) -> str:

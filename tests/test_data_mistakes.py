@@ -285,7 +285,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
     one, other = (co.read_log(tmp_path / name) for name in ("plain.csv", "anew.csv"))
     assert same(one.recording, other.recording)
     assert other.summary.assumed.keys() - one.summary.assumed.keys() == {
-        f"stamps begin anew after {period} s: those before half of it count on"
+        f"stamps wrap around after {period} s: those of its first half come later"
     }
     after, file = plain["t"] >= period, tmp_path / "truth.csv"
     for truth in (plain, anew, *[anew[after]] * (period % 86400 == 0)):
@@ -412,4 +412,4 @@ def test_ranges_that_end_at_the_most_that_is_measured_are_left_out(tmp_path):
     one, other = (read_log(tmp_path / name) for name in "ab")
     assert 100 < len(other.recording.links) < 0.9 * rows["range"].count()
     assert same(one.recording, other.recording)
-    assert "at the most that is measured, of what is further away" in str(one.summary)
+    assert "at their maximum, of partners farther away" in str(one.summary)

@@ -181,7 +181,7 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
     alone = error(log(tmp_path / "fixes", "car", std, 10)[0], co.Kalman())
     known = error(log(tmp_path / "known", "car", std, 10, **odometry, **compass)[0], co.Kalman())
     turning = log(tmp_path / "gyro", "car", std, 10, **odometry, **gyro)[0]
-    assert "is the course of the fixes, carried on by yaw rates" in str(turning.summary)
+    assert "is the course of the fixes, between them by yaw rates" in str(turning.summary)
     by_fixes = log(tmp_path / "course", "car", std, 10, **odometry)[0]
     for method in (co.Kalman(), co.CooperativeFilter()):
         assert error(turning, method) < max(0.85 * alone, 1.3 * known)

@@ -219,7 +219,7 @@ def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):
     write_bag(tmp_path / "drive", fleet, 2, late=0.25, invalid=40)
     by_header, received = (read_log(tmp_path / "drive", dt=0.1, stamps=stamps) for stamps in ("header", "received"))
     assert received.recording.t[0] - by_header.recording.t[0] == pytest.approx(0.25, abs=1e-5)
-    assert "times are those of stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)
+    assert "times are by stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)
     assert by_header.summary.refused["fixes that the receiver calls invalid"][0] == 1
 
 

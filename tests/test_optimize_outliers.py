@@ -77,7 +77,7 @@ def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused():
     problem = problem.add("relative_position", ("A1", "L0"), [1.0, 0.0], std=0.1)
     problem = problem.add("range", ("A0", "A1"), 1.0, std=0.1)
     problem = problem.add("relative_pose", ("A0", "A1"), pose([1.0, 0.0]), std=0.02)
-    with refused(r"candidates.*known inliers that hold all nodes.*any"):
+    with refused(r"candidates.*known inliers that determine all nodes.*any"):
         solve_gnc(problem.replace_unchecked(x0=pose(np.array([[0.0, 0], [1, 0], [2, 0]]))), [2], start="known")
 
 

@@ -144,19 +144,14 @@ class Results:
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
-        check_metric(frame, value)
+        if value not in frame:
+            raise unknown("metric", value, frame.columns)
+        if len(scores := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(scores):
+            raise InputError("metric", repr(value), "must be a column of numbers", "It holds text or lists.")
         for axis in self.axes:
             if axis in frame and axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
                 mixed = ", ".join(map(str, frame[axis].unique()))
                 raise InputError(axis, mixed, "would be averaged together", f"Name {axis} in where, rows or columns.")
-
-
-def check_metric(frame: pd.DataFrame, value: str) -> None:
-    """InputError unless `value` is a column of numbers."""
-    if value not in frame:
-        raise unknown("metric", value, frame.columns)
-    if len(scores := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(scores):
-        raise InputError("metric", repr(value), "must be a column of numbers", "It holds text or lists.")
 
 
 def _is(column: "pd.Series[Any]", value: Any) -> "pd.Series[bool]":

@@ -170,8 +170,8 @@ def update_jointly(
     d, begin, end = options.d, measured.first[t], measured.first[t + 1]
     left_out = np.zeros(end - begin, np.int64)
     for k in range(begin, end):
-        i, j = d * measured.ends[k, 0], d * max(measured.ends[k, 1], 0)
-        if max(poses.cov[i, i], poses.cov[j, j]) > 0.5 * noise.flat:
+        i, j = d * measured.ends[k, 0], d * measured.ends[k, 1]
+        if max(poses.cov[i, i], poses.cov[j, j] if j >= 0 else 0.0) > 0.5 * noise.flat:
             left_out[k - begin] = UNPLACED
     if options.passes > 1:
         poses.prior_x[:], poses.prior_cov[:] = poses.x, poses.cov
