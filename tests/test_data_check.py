@@ -37,11 +37,6 @@ def cars(folder: Path, change: Any = lambda frame: frame, rate: float = 0.1) -> 
     return folder
 
 
-def in_fixes(frame: pd.DataFrame) -> pd.DataFrame:
-    here = np.flatnonzero(frame["x"].notna())[::20]
-    return frame.assign(x=frame["x"].where(~frame.index.isin(here), frame["x"] + 15))
-
-
 def body_twist(frame: pd.DataFrame) -> pd.DataFrame:
     moves = frame["vx"].notna()
     speed = np.hypot(frame["vx"], frame["vy"])
@@ -51,7 +46,10 @@ def body_twist(frame: pd.DataFrame) -> pd.DataFrame:
 FAULTS: dict[str, tuple[Any, str]] = {
     "none": (lambda f: f, "^$"),
     "one range of twenty": (lambda f: f.assign(range=outliers(f["range"])), r"[345]\.\d% of the ranges lie beyond 5"),
-    "one fix of twenty": (in_fixes, r"car0: [45]\.\d% of the fixes lie beyond 5"),
+    "one fix of twenty": (
+        lambda f: f.assign(x=f["x"] + 15 * f.index.isin(np.flatnonzero(f["x"].notna())[::20])),
+        r"car0: [45]\.\d% of the fixes lie beyond 5",
+    ),
     "stamps without their fraction": (
         lambda f: f.assign(t=np.floor(f["t"])),
         r"\d\d% of what was logged is not used, first of all \d+ repeated rows .*stamp\.sec without nanosec",
@@ -72,7 +70,7 @@ FAULTS: dict[str, tuple[Any, str]] = {
         r"car0: its odometry is 0\.0[56]\d* \+- \S+ s later than the truth, its fixes are not",
     ),
     "leap seconds": (lambda f: f.assign(t=f["t"] + 18 * f["x"].notna()), r"car1: its fixes are 18 s behind the"),
-    "a fix held": (lambda f: f.assign(x=f["x"].where(~f["t"].between(9, 30), 5), y=0 * f["x"]), "fixes that stay"),
+    "a fix held": (lambda f: f.assign(x=f["x"].where(~f["t"].between(9, 30), 5), y=0 * f["x"]), "fixes that repeat"),
     "fixes far from the truth of who stands": (
         lambda f: f.assign(**dict.fromkeys(["x", "y", "vx", "vy"], 0 * f["x"])),
         r"car0: fixes lie \S+ m east and \S+ m north of the truth in the median. Has it another frame",

@@ -26,15 +26,13 @@ def paper_rho(r: float, mu: float) -> float:
 @pytest.mark.parametrize("mu", [0.05, 1.0, 7.0, 300.0])
 def test_weights_are_those_of_the_surrogate(mu):
     """w = d rho_mu / d r^2, and the minimiser of w r^2 + Phi_mu(w), whose minimum is rho_mu (Black and Rangarajan)."""
-
-    def penalty(w):
-        return mu * (1 - w) / (mu + w)
-
     for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
         weight = float(graduated.weights(np.array(r**2), mu))
         gradient_ = (paper_rho(np.sqrt(r**2 + 1e-7), mu) - paper_rho(np.sqrt(r**2 - 1e-7), mu)) / 2e-7
         assert weight == pytest.approx(gradient_, abs=1e-6)
-        dual = minimize_scalar(lambda w, r=r: w * r**2 + penalty(w), bounds=(0, 1), options={"xatol": 1e-12})
+        dual = minimize_scalar(
+            lambda w, r=r: w * r**2 + mu * (1 - w) / (mu + w), bounds=(0, 1), options={"xatol": 1e-12}
+        )
         assert dual.fun == pytest.approx(paper_rho(r, mu), abs=1e-5)
         assert weight == pytest.approx(dual.x, abs=2e-3)
 

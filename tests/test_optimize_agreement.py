@@ -139,16 +139,12 @@ def test_every_backend_agrees_on_robust_losses(backend, name, loss):
     plain = case(name)
     robust = replace(plain.factors[-1], loss=Loss(loss, 1.5))
     problem = replace(plain, factors=(*plain.factors[:-1], robust), x0=reference(name).x)
-    if backends_lacking(backend, problem):
+    if require_backend(EVERY[backend]).capabilities.lacking(problem):
         with refused(f"cannot be solved by {backend}"):
             solve(problem, EVERY[backend])
         return
     ours, theirs = solve(problem), solve(problem, EVERY[backend])
     same_minimum(theirs, ours)
-
-
-def backends_lacking(backend: str, problem: Problem) -> list[str]:
-    return require_backend(EVERY[backend]).capabilities.lacking(problem)
 
 
 def test_graduated_non_convexity_calls_a_plug_in():

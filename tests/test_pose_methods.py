@@ -217,14 +217,3 @@ def test_after_a_gap_it_begins_anew():
     error = filter_._begins(seen, [1])[:, 1, 1, 3] - np.arctan2(*fleet.velocity[90, 1, 1::-1])
     assert np.abs(wrap(error)) < 0.3
     assert filter_(seen, [1]).absent.sum() == 40
-
-
-def test_a_member_that_no_fix_has_placed_costs_no_other_one_its_landmarks():
-    """The first member comes back without fixes, far away: the second has its pose as alone."""
-    fleet, away = convoy(2, 100, 3), np.zeros((100, 5, 3))
-    away[:, 0], away[20:30, 0] = 1e4, np.nan
-    seen = observed(replace(fleet, position=fleet.position + away, velocity=fleet.velocity + 0 * away), runs=2)
-    gnss = seen.gnss.copy()
-    gnss[:, 20:, 0] = np.nan
-    both, alone = (co.PoseFilter(unit)(replace(seen, gnss=gnss), [1]).x for unit in ("fleet", "solo"))
-    np.testing.assert_allclose(both, alone, atol=1e-6)

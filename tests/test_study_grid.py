@@ -14,7 +14,7 @@ from coopoc.study.cell import assignments, parse
 from coopoc.study.provenance import code_of
 from coopoc.study.run import find_study, plan, run_study
 from coopoc.study.study import Study, digest
-from coopoc.study.tables import Table, pivot
+from coopoc.study.tables import pivot
 
 
 def study(**changes: object) -> Study:
@@ -213,16 +213,12 @@ def demo(view: object) -> Study:
     return Study("demo", "?", computed, {"noise_model": ("nominal",), "x": (1,)}, tables={"a": view})  # type: ignore[dict-item]
 
 
-def no_results() -> Table | None:
-    return None
-
-
 @pytest.mark.parametrize(
     ("view", "message"),
     [
         (partial(pivot, row="x", columns="x", value="y"), r"tables\['a'\].*must be a function of the Results alone"),
         (partial(pivot, rows="x"), "must be a function of the Results alone"),
-        (no_results, "must be a function of the Results alone"),
+        (lambda: None, "must be a function of the Results alone"),
         (3, "must be a function of the Results alone"),
     ],
 )

@@ -28,10 +28,6 @@ class Reader(NamedTuple):
     read: Callable[[Path], Any]
 
 
-def _manifest(folder: Path) -> None:
-    Results.load(folder)
-
-
 def _views(folder: Path) -> None:
     for form in FORMATS:
         publish.tables(folder, form)
@@ -67,7 +63,7 @@ READERS: Mapping[str, Reader] = {
     "log": Reader({"log.csv": good.LOG}, lambda d: read_log(d / "log.csv", any_scale=True)),
     "wide log": Reader({"car.csv": good.WIDE}, lambda d: read_log(d / "car.csv", columns=NAMES)),
     "nmea": Reader({"car.nmea": good.NMEA}, lambda d: read_log(d / "car.nmea")),
-    "manifest": Reader({"manifest.json": good.MANIFEST}, _manifest),
+    "manifest": Reader({"manifest.json": good.MANIFEST}, Results.load),
     "views": Reader({"views.json": good.VIEWS}, _views),
     "reference": Reader({"made.json": good.REFERENCE}, _reference),
     "card": Reader({"card.json": good.CARD}, _card),
