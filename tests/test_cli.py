@@ -203,7 +203,7 @@ def test_an_interrupted_run_says_so_and_resumes(tmp_path, jobs):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        preexec_fn=_listen,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells let background jobs ignore it
     )
     cells = tmp_path / "runs/small/cells"
     for _ in range(1000):
@@ -217,8 +217,3 @@ def test_an_interrupted_run_says_so_and_resumes(tmp_path, jobs):
     assert "Traceback" not in stderr
     plan = json.loads(coopoc(*words, "--dry-run", cwd=tmp_path).stdout)
     assert 3 <= plan["finished"] < 9
-
-
-def _listen():
-    """Hear Ctrl-C even where the tests run in the background of a shell, which makes its jobs ignore it."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -73,8 +73,8 @@ def test_scipy_finds_the_same_robust_minimum(name, seed):
     def residual(free):
         return plain.whiten(np.concatenate([problem.x0[:4], free.reshape(2, 3)]))[0]
 
-    geman_mcclure = lambda s: np.stack([s / (1 + s), (1 + s) ** -2.0, -2 * (1 + s) ** -3.0])  # noqa: E731
-    loss, ours = geman_mcclure if name == "geman-mcclure" else name, solve(problem)
+    printed = {"geman-mcclure": lambda s: np.stack([s / (1 + s), (1 + s) ** -2.0, -2 * (1 + s) ** -3.0])}
+    loss, ours = printed.get(name, name), solve(problem)
     near = ours.x[4:] + np.random.default_rng(seed).normal(0, 0.1, (2, 3))
     exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-12}
     tries = [

@@ -44,9 +44,8 @@ S2 = Sensors.paper_scenario2()
     ],
 )
 def test_unusable_fleet_names_the_field(change, field):
-    good = {"ids": ("a", "b"), "t": [0.0, 0.1, 0.2], "position": np.zeros((3, 2, 3)), "velocity": np.zeros((3, 2, 3))}
     with pytest.raises(InputError) as error:
-        Fleet(**{**good, **change})
+        replace(Fleet(("a", "b"), [0.0, 0.1, 0.2], *np.zeros((2, 3, 2, 3))), **change)
     assert error.value.field == field
     assert error.value.hint
 

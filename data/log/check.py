@@ -224,8 +224,8 @@ def _noisier(c: Check, column: int) -> str:
         return ""
     at = t[off.index[size > 0.5 * scatter.max()]]
     return (
-        f"its fixes scatter by {scatter.max():.2g} times what they state from {at[0]:.3g} to {at[-1]:.3g} s, as of a "
-        "receiver that has lost its base or satellites: give std columns that say so, or leave these out."
+        f"its fixes scatter by {scatter.max():.2g} times their standard deviation from {at[0]:.3g} to {at[-1]:.3g} s: "
+        "did the receiver lose its base or satellites? Give columns of std, or leave these fixes out."
     )
 
 
@@ -243,7 +243,7 @@ def _of_rows(c: Check) -> Iterator[str]:
         hint = next((hint for begin, hint in ADVICE.items() if why.startswith(begin)), "")
         first = summary.refused[why][1]
         yield (
-            f"{share:.0%} of what was logged is not used, first of all {left[why]} {why}"
+            f"{share:.0%} of what was logged is not used, mostly {left[why]} {why}"
             + f" (first: {first})" * bool(first)
             + f". {hint}".rstrip(" ")
         )
@@ -255,8 +255,8 @@ def _of_rows(c: Check) -> Iterator[str]:
 def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
     """Vehicles whose filter errs by more than it states, or misses fixes so, and no sentence says why."""
     return [
-        f"{row['vehicle']}: its {row['misses']} by {row['per_std']:.1f} times what its filter states from "
-        f"{row['worst_at_s']:.3g} s on: by what other lines name, or by noise that is not as stated."
+        f"{row['vehicle']}: its {row['misses']} by {row['per_std']:.1f} times its standard deviation from "
+        f"{row['worst_at_s']:.3g} s on: see the other lines, or the stated noise is wrong."
         for row in sorted(c.vehicles, key=lambda row: -row["per_std"])
         if row["per_std"] > CONFIDENT_RATIO
         and (row["misses"] == "filter errs" or not any(one.startswith(f"{row['vehicle']}: ") for one in named))
@@ -293,7 +293,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     if (pace := float(np.hypot(east, north))) > max(BESIDE, SURE_ERRORS * unsure):
         sentences.append(
             f"{name}: it moves by {pace:.2f} +- {unsure:.2f} m/s towards "
-            f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x beside what its odometry shows: wind, a "
+            f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x relative to its odometry: wind, a "
             f"current, a ferry; or fixes that drift. offset={name}.vx:{-east:.2g},{name}.vy:{-north:.2g} takes it off; "
             "if it changes, the std of a speed or velocity that lets filters follow the fixes is "
             f"{pace * (len(c.world.t) / row['fixes']) ** 0.5:.2g} m/s."

@@ -415,7 +415,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     if dt is None:
         dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST_STEP):.3g}")
         if dense < step:
-            interpolated = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
+            interpolated = f"odometry every {step:g} s is interpolated, which looks as far ahead"
             summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {interpolated}")
             step = dense
         seldom = float(f"{min(pairs, fixes, LONGEST_STEP):.3g}")  # unknown where there are no pairs

@@ -38,7 +38,8 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     (inputs / "good").write_bytes(packed({name: text.encode() for name, text in reader.files.items()}))
     words = dict.fromkeys([*TOKENS, *re.findall(r"[\w:./+-]+", " ".join(reader.files.values()))])
-    (own / "tokens").write_text("".join(f'"{_quoted(word)}"\n' for word in words if 0 < len(word) < 60))
+    quoted = ("".join(f"\\x{byte:02x}" for byte in word.encode()) for word in words if 0 < len(word) < 60)
+    (own / "tokens").write_text("".join(f'"{word}"\n' for word in quoted))
     known: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -63,10 +64,6 @@ def main() -> None:
         seeds = [str(inputs), *([str(found)] if (found := CORPUS / own.name).is_dir() else [])]
         atheris.Setup([sys.argv[0], *ends, *options, "-print_final_stats=1", *seeds], once)
         atheris.Fuzz()
-
-
-def _quoted(token: str) -> str:
-    return "".join(f"\\x{byte:02x}" for byte in token.encode())
 
 
 if __name__ == "__main__":
