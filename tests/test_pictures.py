@@ -8,7 +8,7 @@ import unicodedata
 import matplotlib
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import refused, winding
 from latex import compiled
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -73,7 +73,12 @@ def test_a_track_shows_paths_and_truth(seen):
     assert len(ax.patches) == 2 * 3
     assert len(co.plot_track(co.GNSS()(recording, [24])).patches) in (0, 60)
     crowd = co.plot_track(co.GNSS()(co.observe(fleet, co.Sensors()), range(60)), fleet=fleet)  # names would hide paths
-    assert [text.get_text() for text in crowd.get_legend().texts] == ["truth"]
+    road = winding(400, 9.0, 900.0)
+    drive = co.observe(road, co.Sensors())
+    line = co.plot_track(co.Kalman()(drive), co.plot_recording(drive), fleet=road)
+    assert line.get_aspect() == "auto" != ax.get_aspect()
+    for picture, labels in ((crowd, ["truth"]), (line, ["a", "t = 19.9 s", "truth"])):
+        assert [text.get_text() for text in picture.get_legend().texts] == labels
 
 
 @pytest.mark.parametrize(

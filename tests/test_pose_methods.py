@@ -166,8 +166,8 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
         truths.append(
             pd.DataFrame({"t": t, "vehicle": name, "x": place.real, "y": place.imag, "heading": wrap(heading)})
         )
-    pd.concat(tables).to_csv(tmp_path / "log.csv", index=False)
-    pd.concat(truths).to_csv(tmp_path / "truth.csv", index=False)
+    pd.concat(tables).to_csv(tmp_path / "log.csv")
+    pd.concat(truths).to_csv(tmp_path / "truth.csv")
     log = co.read_log(tmp_path, frame="body")
     rec, own = log.recording, [log.recording.ids.index(name) for name in "abc"]
     begin = co.pose_start(rec)

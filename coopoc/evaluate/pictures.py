@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5B3A1E", "#4D4D4D")
 """Okabe and Ito's, then brown and grey; what is beyond them begins again."""
 INK, PALE = "#2B2F36", "#C3CBD6"
+NARROW = 8.0
+"""Length over width of a picture, from which each axis has a scale of its own."""
 SHARE_95 = 5.991464547107979
 """Quantile of chi-square with two degrees of freedom: squared radius of a 95 % ellipse in standard deviations."""
 
@@ -170,9 +172,15 @@ def axes(ax: "Axes | None") -> "Axes":
 
 
 def finish(ax: "Axes") -> "Axes":
-    """With a legend of what has a label."""
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="best", fontsize=8, frameon=False)
+    """With a legend beside it, one entry for each label, and a scale of its own for each axis where one for both would
+    make a line of all."""
+    short, far = sorted((ax.dataLim.width, ax.dataLim.height))
+    if 0.0 < NARROW * short < far:
+        ax.set_aspect("auto")
+        ax.set_title("The axes have different scales.", fontsize=8, color=INK)
+    handles, labels = ax.get_legend_handles_labels()
+    if entries := dict(zip(labels, handles, strict=True)):
+        ax.legend(entries.values(), entries, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
     return ax
 
 
