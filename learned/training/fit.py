@@ -214,8 +214,7 @@ def fit_okf(
     2
     """
     began, like = time.perf_counter(), NoiseParameters()
-    each = (padded([part]) for part in (training, validation))
-    data, judge = ((Batch(*(a.double() for a in batch[:4]), *batch[4:]), share.double()) for batch, share in each)
+    data, judge = (_doubled(*padded([part])) for part in (training, validation))
     logs = like.logs.detach().double().reshape(1, -1).clone().requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
@@ -235,6 +234,12 @@ def fit_okf(
         factor = log_scale((over_time(normalised.square(), normalised.isfinite()) * share).sum(1))
         made = like.with_logs(best.view(3, 3) + factor)
     return made, {"validation_loss": tuple(history), "seconds": time.perf_counter() - began}
+
+
+def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
+    """The same in float64."""
+    gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
+    return Batch(gnss, velocity, truth, x0, batch.dt, batch.exact), share.double()
 
 
 def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
