@@ -270,7 +270,7 @@ def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
         late = slice(30 * (given == "speed,yaw_rate"), None)  # when the fixes have shown where it points
         near = 0.4 if given == "" else 0.05  # m, since a course of fixes lags behind
         assert_allclose(rec.gnss[0, late, 0] @ [1, 1j, 0], (seen - off * ahead)[late], atol=near)
-        assert ("to the antenna, of car (1.5, 0.5, 0 m forward, left, up, by" in " ".join(rec.notes)) == bool(option)
+        assert ("reference point, of car (1.5, 0.5, 0 m forward, left, up, by" in " ".join(rec.notes)) == bool(option)
 
 
 def turned_drive(folder: Path, speed: Any, turn: float, seconds: float = 120.0) -> Path:

@@ -174,7 +174,7 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):
     assert np.abs(body.yaw_rate[0]).max(axis=0) == pytest.approx([0.06, 0.0], abs=1e-3)
     stands = read_log(path, dt=0.1, ignore=["/car0/pose"], truth="/car1/odom", origin=(48.14, 11.58, 560.0)).truth
     assert not stands.position[:, 1].any()  # that of its poses, which the test left at zero
-    for wrong, match in (({"truth": "/car0/poses"}, "Did you mean /car0/pose"), ({"kinds": {"a": "x"}}, "of tables")):
+    for wrong, match in (({"truth": "/car0/poses"}, "Did you mean /car0/pose"), ({"kinds": {"a": "x"}}, "to tables")):
         with refused(match):
             read_log(path, dt=0.1, **wrong)
 
