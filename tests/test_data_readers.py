@@ -159,7 +159,7 @@ def test_a_left_handed_table_is_mirrored(tmp_path):
     fleet = load_fleet("town10").between(0, 100).select([0, 6])
     write_table(fleet, tmp_path / "drive.csv")
     frame = pd.read_csv(tmp_path / "drive.csv")
-    frame.assign(t=1000 * frame["t"], y=-frame["y"], vy=-frame["vy"]).to_csv(tmp_path / "left.csv", index=False)
+    frame.assign(t=1000 * frame["t"], y=-frame["y"], vy=-frame["vy"]).to_csv(tmp_path / "left.csv")
     read = load_fleet(f"{tmp_path / 'left.csv'}?scale=y:-1,vy:-1,t:1e-3")
     assert_allclose(read.position, fleet.position, atol=1e-9)
     assert_allclose(read.velocity, fleet.velocity, atol=1e-9)
@@ -177,7 +177,7 @@ def drive(t: np.ndarray, **more: object) -> pd.DataFrame:
 def test_a_gap_is_one_whenever_time_starts(tmp_path, start):
     """13 s are missing between 4.9 and 18 s: 130 instants, and every other one is there."""
     t = start + np.round(np.r_[np.arange(0, 5, 0.1), np.arange(18, 23, 0.1)], 6)
-    drive(t).to_csv(tmp_path / "a.csv", index=False)
+    drive(t).to_csv(tmp_path / "a.csv")
     fleet = load_fleet(tmp_path / "a.csv", dt=0.1)
     assert (~fleet.present).sum() == 130
     assert fleet.present.sum() == len(t)
@@ -200,7 +200,7 @@ def test_interpolation_agrees_with_pandas():
 def test_degrees_are_not_metres(tmp_path):
     t = np.arange(0, 5, 0.1)
     degrees = {"x": 11.58 + 1e-5 * t, "y": 48.14 + 4e-5 * t}
-    drive(t).assign(**degrees).to_csv(tmp_path / "a.csv", index=False)
+    drive(t).assign(**degrees).to_csv(tmp_path / "a.csv")
     with refused(r"columns x, y = 11\.58\.\.11\.58.*look like degrees.*read_log"):
         load_fleet(tmp_path / "a.csv")
     assert load_fleet(tmp_path / "a.csv", any_scale=True).position[0, 0, 1] == 48.14
@@ -213,7 +213,7 @@ def test_dates_are_seconds_since_1970(tmp_path, unit, zone):
     stamps = t if zone is None else t.tz_localize("UTC").tz_convert(zone)
     frame = drive(np.arange(5) / 10).assign(t=stamps)
     frame.to_parquet(tmp_path / "a.parquet", index=False)
-    frame.assign(t=[stamp.isoformat() for stamp in stamps]).to_csv(tmp_path / "a.csv", index=False)
+    frame.assign(t=[stamp.isoformat() for stamp in stamps]).to_csv(tmp_path / "a.csv")
     for name in ("a.parquet", "a.csv"):
         assert_allclose(load_fleet(tmp_path / name).t, 1.7e9 + np.arange(5) / 10, atol=1e-6, rtol=0)
 
@@ -251,7 +251,7 @@ def test_damaged_tables_are_named(tmp_path):
 
 def test_what_no_memory_holds_is_refused_at_once(tmp_path):
     began = time.process_time()
-    drive(1e18 + 1e8 * np.arange(5)).to_csv(tmp_path / "a.csv", index=False)
+    drive(1e18 + 1e8 * np.arange(5)).to_csv(tmp_path / "a.csv")
     with refused(r"a\.csv: column t with dt = 0\.1 s = .* steps .*nanoseconds"):
         load_fleet(tmp_path / "a.csv", dt=0.1, any_scale=True)
     (tmp_path / "b.csv").write_text(",".join(["t"] * 100_000) + "\n")
@@ -370,7 +370,7 @@ def test_a_parquet_table_is_refused_by_its_pages(tmp_path, monkeypatch, x, lie):
     whole, chunk = path.read_bytes(), read_metadata(path).row_group(0).column(0)
     start = -8 - int.from_bytes(whole[-8:-4], "little")
     footer = whole[start:].replace(b"\x25\x02\x18\x01x", b"\x25\x00\x18\x01x", -1 if len(x) > 2 else 0)
-    for size in {chunk.num_values, chunk.total_uncompressed_size} - {*range(64)}:
+    for size in (chunk.num_values, chunk.total_uncompressed_size):
         footer = footer.replace(bytes([2 * size % 128 | 128, size >> 6]), lie)
     path.write_bytes(whole[:start] + footer)
     monkeypatch.setattr("coopoc.data.cells.LARGEST_TABLE", 150)

@@ -70,7 +70,7 @@ def test_the_table_of_a_fleet_is_read_again_without_the_absent(tmp_path):
     assert len(frame) == 13
     assert not frame.isna().any(axis=None)
     assert frame[frame.vehicle == "green"].step.tolist() == [2, 3, 4]
-    frame.to_csv(tmp_path / "drive.csv", index=False)
+    frame.to_csv(tmp_path / "drive.csv")
     again = co.load_fleet(tmp_path / "drive.csv", format="table", columns={"id": "vehicle"})
     columns = [again.ids.index(name) for name in IDS]
     assert_allclose(again.position[:, columns], position)
