@@ -394,8 +394,7 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     measured of range, azimuth and inclination."""
     away, azimuth, inclination = spherical(*edges.vector.T)
     flat = np.maximum(np.hypot(*edges.vector[:, :2].T), MIN_GROUND_DISTANCE)
-    metres = np.stack([np.ones_like(away), flat, away], axis=1)
-    gradients = directions(azimuth, inclination) / metres[..., None]
+    gradients = directions(azimuth, inclination) / np.stack([np.ones_like(away), flat, away], axis=1)[..., None]
     weight = np.square(std) ** -1.0 * edges.measured
     return np.asarray(gradients.swapaxes(1, 2) @ (weight[..., None] * gradients))
 

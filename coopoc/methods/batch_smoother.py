@@ -189,7 +189,6 @@ def located(recording: Recording) -> Bools:
     A vehicle that has no fix yet has no position to linearise at: until then it takes no part.
     """
     present = recording.present
-    before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
-    joined = last_true(present & ~before)
+    joined = last_true(present & ~np.concatenate([np.zeros_like(present[:1]), present[:-1]]))
     fix = last_true(np.isfinite(recording.gnss).all(axis=-1), axis=1)
     return present & (fix >= joined)

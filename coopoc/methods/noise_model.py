@@ -180,8 +180,7 @@ class NoiseModel:
 
     def fix_scale(self, recording: Recording) -> Floats:
         """(T, N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
-        scale = check_recording(recording).fix_scale
-        return np.ones((1, 1, 1)) if self.sensors is None else scale
+        return np.ones((1, 1, 1)) if self.sensors is None else check_recording(recording).fix_scale
 
     @property
     def gnss_variance(self) -> Floats:

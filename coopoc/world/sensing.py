@@ -266,8 +266,7 @@ def schedule(ids: Sequence[str], t: Floats, links: Links, v2x: V2X, runs: int, s
     count = np.floor((np.arange(-1, len(t))[:, None] + 1e-9) * per_step + phase)
     sends = np.diff(count, axis=0) > 0
     sent = sends[links.step, links.neighbour]
-    delay = int(np.ceil(v2x.latency / dt - 1e-9))
-    arrival = np.where(sent, links.step + delay, -1)[None].repeat(runs, axis=0)
+    arrival = np.where(sent, links.step + int(np.ceil(v2x.latency / dt - 1e-9)), -1)[None].repeat(runs, axis=0)
     if v2x.loss > 0:
         number = (np.cumsum(sends, axis=0) - 1)[links.step, links.neighbour]
         for observer, neighbour, pair, _ in _pairs(ids, links):

@@ -101,8 +101,7 @@ def spoofed(
                 offset[run, column] = common if attack.collude else _offset(draws, attack)
     error = attack.size(recording.t)[:, None, None] * offset[:, None]
     gnss = np.where(error != 0, np.nan, recording.gnss) if remove_outliers else recording.gnss + error
-    note = attack.note + ", removed" * remove_outliers
-    return replace(recording, gnss=gnss, notes=(*recording.notes, note))
+    return replace(recording, gnss=gnss, notes=(*recording.notes, attack.note + ", removed" * remove_outliers))
 
 
 def _offset(draws: np.random.Generator, attack: Spoofing) -> Floats:

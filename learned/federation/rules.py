@@ -78,8 +78,7 @@ def mean(weights: Tensor, sizes: Tensor) -> Tensor:
     >>> mean(torch.tensor([[1.0], [3.0]]), torch.tensor([3.0, 1.0])).tolist()
     [1.5]
     """
-    share = (sizes.double() / sizes.double().sum()).to(weights.dtype)
-    return (share[:, None] * weights).sum(0)
+    return ((sizes.double() / sizes.double().sum()).to(weights.dtype)[:, None] * weights).sum(0)
 
 
 def median(weights: Tensor, sizes: Tensor | None = None) -> Tensor:

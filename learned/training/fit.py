@@ -166,8 +166,7 @@ class Judge:
     def __call__(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
             parts = [(self.like.losses(theta, batch) * share).unbind(1) for batch, share in self.batches]
-        means = [reduce(torch.add, each) for each in parts]
-        return torch.stack(means).nan_to_num(math.inf, math.inf).amax(0)
+        return torch.stack([reduce(torch.add, each) for each in parts]).nan_to_num(math.inf, math.inf).amax(0)
 
 
 def padded(parts: Sequence[Segments]) -> tuple[Batch, Tensor]:

@@ -88,9 +88,8 @@ def _locator(function: Any) -> Any:
 
 def versions() -> dict[str, str]:
     """What machine code depends on beside its sources and the processor."""
-    python = "{}.{}".format(*sys.version_info)
     return {
-        "python": python,
+        "python": "{}.{}".format(*sys.version_info),
         "numba": numba.__version__,
         "llvmlite": llvmlite.__version__,
         "platform": llvm.get_process_triple(),

@@ -187,5 +187,4 @@ def inverse(m: Any) -> Any:
     d, e, c = y.plus(w * f, w), -(w * f), v * f
     b = c * w
     b = -(b.plus(u, y))
-    a = x.plus(u * y, u).plus(c, v)
-    return [a, b, c, b, d, e, c, e, f]
+    return [x.plus(u * y, u).plus(c, v), b, c, b, d, e, c, e, f]

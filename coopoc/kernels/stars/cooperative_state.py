@@ -290,8 +290,7 @@ def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats, count: int) 
     before, fix, noise = load(f.ego[VOTES:], 0, NO_VOTES), vector_at(own, FIX // 3), vector_at(own, FIX_VARIANCE // 3)
     votes, left = vote(before, moved, process, fix, noise)
     store(f.ego[VOTES:], 0, votes)
-    here = add(vector_at(f.g.x, 0), moved)
-    return left > 0.0 and speak_for(f, model, own, rows, count, here, fix) <= 0.0
+    return left > 0.0 and speak_for(f, model, own, rows, count, add(vector_at(f.g.x, 0), moved), fix) <= 0.0
 
 
 @part

@@ -111,8 +111,7 @@ def forget(star: Star, gates: Gates, k: int, where: float, flat: float) -> None:
 def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
     """How many neighbours, measured whole, are where their messages say if the ego is at a position."""
     agree = o = 0.0 * at[0]
-    own = add(variance, variance_of(star, 0))
-    noise = add(own, (o + 1.0, o + 1.0, o + 1.0))
+    noise = add(add(variance, variance_of(star, 0)), (o + 1.0, o + 1.0, o + 1.0))
     for k in range(1, n):
         polar = relative_of(star, k)
         gap, sent = subtract(position_of(star, k), add(at, vector(polar))), variance_of(star, k)

@@ -187,8 +187,7 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
     for k in range(n):
         previous = star.previous[k]
         if previous >= 0:
-            at = add(vector_at(joint.move, previous), moved_of(star, k))
-            store(joint.state, k, at)
+            store(joint.state, k, add(vector_at(joint.move, previous), moved_of(star, k)))
             store(joint.process, block_of(previous, old), process_information(star, k))
         elif k == 0:
             store(joint.state, k, position_of(star, k))
@@ -205,8 +204,7 @@ def first_place(star: Star, k: int, ego: Numbers) -> Lanes:
         return measured
     new = take(star.status, 5 * k + NEW) - 0.5
     near = polar[0] + 1.0
-    somewhere = add(ego, (near, near, 0.1 * near))
-    broadcast = choose_each(new, position_of(star, k), somewhere)
+    broadcast = choose_each(new, position_of(star, k), add(ego, (near, near, 0.1 * near)))
     return choose_each(missing(polar), broadcast, measured)
 
 
@@ -218,8 +216,7 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
         if star.previous[k] >= 0:
             at = vector_at(joint.state, k)
             own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
-            new = take(star.status, 5 * k + NEW) - 0.5
-            there = choose_each(new, position_of(star, k), at)
+            there = choose_each(take(star.status, 5 * k + NEW) - 0.5, position_of(star, k), at)
             store(joint.state, k, choose_each(own - LEAST_KNOWN, at, there))
 
 

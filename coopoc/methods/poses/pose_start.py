@@ -109,11 +109,10 @@ def _reckoned(recording: Recording, column: int, scale: float = 0.0, bias: float
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
     """Noise of measurements of vehicles whose places are as uncertain as a fix, at these ranges (L,) m."""
     fix = max(noise.fix_std[:2])
-    apart = max(float(np.median(ranges)), fix)
     return replace(
         noise,
         range_std=float(np.hypot(noise.range_std, fix)),
-        azimuth_std=float(np.hypot(noise.azimuth_std, fix / apart)),
+        azimuth_std=float(np.hypot(noise.azimuth_std, fix / max(float(np.median(ranges)), fix))),
     )
 
 
