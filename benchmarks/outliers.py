@@ -71,7 +71,7 @@ def fleet(seed: int, d: int, robots: int, share: float) -> list[object]:
     bad = wrong(graph)[-len(between) :]
     problem = from_graph(lost(graph), start="odometry")
     began = time.process_time()
-    solution = solve_gnc(problem, loop_closures(problem), start="known", throw=False)
+    solution = solve_gnc(problem, loop_closures(problem), throw=False)
     out = solution.extras["weights"] < 0.5
     error = alignment_error(solution.position, drives.position)
     spent = time.process_time() - began

@@ -19,7 +19,6 @@ from .backend import backends
 from .graph_problems import Objective, Start, from_graph, loop_closures
 from .model.problem import Problem
 from .robust.gnc import solve_gnc
-from .robust.loop_closures import MIN_AGREEING
 from .solution import Solution, Status
 from .solve import solve
 
@@ -72,9 +71,6 @@ def solve_file(
         say(solution.status.value)
     for note in solution.notes:
         say(note)
-    for joint in solution.extras.get("joined", ()):
-        if joint["rival"] >= MIN_AGREEING:
-            say("{body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint))
     if size is not None and not 1 / UNLIKELY_FACTOR < size < UNLIKELY_FACTOR:
         say(f"residuals are {size:.2g} times what the file states. {COVARIANCE_HINT}")
     return int(solution.status is not Status.SOLVED)
@@ -89,14 +85,13 @@ def without_outliers(problem: Problem, backend: str) -> Solution:
     """The solution without relative poses that GNC rejects; extras["rejected"] has their names.
 
     Raises:
-        InputError: no relative pose but odometry, which is taken as right, or relative poses that do not decide how
-            robots stand to each other.
+        InputError: no relative pose but odometry, which is taken as right.
     """
     candidates = loop_closures(problem)
     if not candidates:
         allowed = "must hold relative poses beside each robot's odometry"
         raise InputError("outliers", repr(problem), allowed, "Leave out --outliers.")
-    solution = solve_gnc(problem, candidates, backend=backend, throw=False, start="known")
+    solution = solve_gnc(problem, candidates, backend=backend, throw=False)
     nodes = np.concatenate([problem.factors[k].nodes[rows] for k, rows in candidates])
     rejected = [[problem.names[i] for i in pair] for pair in nodes[solution.extras["weights"] < 0.5].tolist()]
     return replace(solution, extras=solution.extras | {"rejected": rejected})
@@ -120,7 +115,7 @@ def described(solution: Solution) -> dict[str, Any]:
     row: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
     row |= {name: getattr(solution, name) for name in named}
     row |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}
-    return row | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}
+    return row | {key: solution.extras[key] for key in ("rejected",) if key in solution.extras}
 
 
 def nodes(solution: Solution) -> dict[str, Any]:

@@ -1,13 +1,12 @@
 """Graduated non-convexity (GNC): least squares whose weights find the outliers."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, instance, one_of
-from ...errors import InputError
+from ...arrays import Floats, instance
 from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import INLIER_WEIGHT, expected, implausible, rejection
@@ -21,8 +20,6 @@ from ..starts.initial import initial_guess
 from .graduated import LAST_MU, Candidates, Graduation, bounds, contest, graduate, mark
 from .loop_closures import known_start
 
-Start = Literal["any", "known"]
-
 
 def solve_gnc(
     problem: Problem,
@@ -31,7 +28,6 @@ def solve_gnc(
     groups: npt.ArrayLike | None = None,
     backend: str | Backend = "gauss-newton",
     throw: bool = True,
-    start: Start = "any",
     **options: Any,
 ) -> Solution:
     """A minimum of 1/2 sum |r_inlier|^2 + 1/2 sum_g rho(r_g^2), r_g^2 = sum over the group of |W (h(x) - z)|^2.
@@ -46,10 +42,9 @@ def solve_gnc(
     majority of consistent outliers wins, and so does an error that all share.
 
     Where known inliers hold every node, as odometry does, they are the start, which candidates join where they are
-    predicted (`loop_closures.py`): a first least squares over wrong loop closures would bend a long drive. Robots that
-    only candidates join are placed by those that agree most. The graduation and other starts (`graduated.py`) race with
-    that, and the least cost wins, unless every candidate is a relative pose or linear, and the noise explains what
-    remains of them.
+    predicted (`loop_closures.py`): a first least squares over wrong loop closures would bend a long drive. The
+    graduation and other starts (`graduated.py`) race with that, and the least cost wins, unless every candidate is a
+    relative pose or linear, and the noise explains what remains of them.
 
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
@@ -59,19 +54,15 @@ def solve_gnc(
             each on its own.
         backend: of `solve`, for the last problem, and with constraints for every round.
         throw: as in `solve`.
-        start: "known" refuses what known inliers leave free and candidates do not decide; "any" goes on from elsewhere.
         options: of the backend.
 
     Returns:
         The Solution of the last weighted problem, whose cost, gradient and covariance are those of the weighted least
-        squares; iterations and times are of all rounds; extras has weights (M,), and "joined", where
-        only candidates join parts: their first nodes, how many candidates agree on their place, how many agree on the
-        best other place (rival), and how many there are.
+        squares; iterations and times are of all rounds; extras has weights (M,).
 
     Raises:
         InputError: candidates that do not exist, appear twice or have a loss, other groups than measurements, a
-            threshold outside (0, 1), an unknown start, known inliers that leave nodes free which the candidates
-            do not place where the start is theirs, and what `solve` refuses.
+            threshold outside (0, 1), and what `solve` refuses.
         SolveError: (if `throw`) as `solve`, or weights that did not settle.
 
     References:
@@ -85,10 +76,9 @@ def solve_gnc(
     'another minimum, elsewhere, costs as much'
     """
     problem = started(instance("problem", problem, Problem))
-    one_of("start", start, Start)
     marked = mark(problem, candidates, groups)
     marked = replace(marked, bound=bounds(marked, threshold))
-    each, extras, began, doubts = list[int](), dict[str, Any](), clock(), tuple[str, ...]()
+    each, began, doubts = list[int](), clock(), tuple[str, ...]()
 
     def inner(part: Problem) -> Floats:
         end: Solution | Arrival
@@ -111,21 +101,13 @@ def solve_gnc(
         s = marked.squares(at) / marked.bound
         return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ np.minimum(s, 1.0))
 
-    best, end = "known", None
-    try:
-        known = known_start(marked, inner)
-    except InputError:  # known inliers leave nodes free, and candidates do not place them
-        if start == "known":
-            raise
-    else:
-        end = finish(known.x, known.weight)
-        extras |= {"joined": known.joined} if known.joined else {}
-    if end is None or (start == "any" and not explained(end)):
+    known = known_start(marked, inner)
+    best, end = "known", finish(*known) if known else None
+    if end is None or not explained(end):
         best, x, graduation, doubts = contest(marked, inner, initial_guess(problem), lambda at: finish(at).x, cost)
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
     final = solve(marked.reweigh(end.weight, end.x), backend, throw=throw and end.settled, **options)
-    extras |= {"start": best, "weights": end.weight[marked.group]}
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < INLIER_WEIGHT).sum())
     notes = (rejection("GNC", out, len(end.weight), "candidates", final.cost, final.expected),) if out else ()
@@ -135,7 +117,7 @@ def solve_gnc(
         solve_seconds=clock() - began - final.build_seconds - final.check_seconds,
         status=status,
         notes=(*notes, *doubts, *final.notes),
-        extras=final.extras | extras,
+        extras=final.extras | {"start": best, "weights": end.weight[marked.group]},
     )
     if throw and not end.settled:
         raise SolveError(solution)
