@@ -66,7 +66,7 @@ def filter_rows(recording: co.Recording) -> list[Row]:
         return Row(words, solves, call, away < 1e-9)
 
     def kernel(refine: bool) -> Any:
-        return run_filter(measured, assumed, refine, False)[0]
+        return run_filter(measured, assumed, refine, False, False)[0]
 
     def all_steps(method: co.JointFilter) -> Any:
         return method(recording, [0]).x[:, :, 0]

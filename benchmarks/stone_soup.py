@@ -110,7 +110,7 @@ def joint_filter() -> Job:
     job = "joint filter, linear"
     return Job(
         [
-            Row(job, "kernel", RUNS * STEPS, lambda: run_filter(measured, assumed, False, False)[0]),
+            Row(job, "kernel", RUNS * STEPS, lambda: run_filter(measured, assumed, False, False, False)[0]),
             Row(job, "Stone Soup, KalmanUpdater", 2 * STEPS, lambda: np.stack([followed(d) for d in drives])),
         ],
         right,
