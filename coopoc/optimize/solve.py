@@ -134,7 +134,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         near = not has_start or abs(problem.cost(given) - problem.cost(result.x)) <= RIVAL_COST
         told = whole or (near and not searching)
         problem, result = (problem, result) if told else _drawn(problem, backend, options, result, has_start)
-    elif has_start:
+    elif has_start and not problem.linear:
         problem, result = _challenged(problem, backend, options, result, whole)
     search = problem.search
     solved = clock()
