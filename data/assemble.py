@@ -317,7 +317,7 @@ def planar_recording(
     links = Links(*table[:, :3].astype(np.int64).T)
     shape = (1, len(t), len(ids), 3)
     gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
-    gnss[0, :, n:] = np.column_stack([position, np.zeros(len(position))])
+    gnss[0, :, n:] = position @ np.eye(2, 3)
     moved[0, :, :n, :2], turning[0, :, :n] = velocity, yaw_rate
     return Recording(
         ids=tuple(ids),

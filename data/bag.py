@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc.arrays import one_of
-from coopoc.errors import InputError, MissingLibraryError, said, unknown
+from coopoc.errors import InputError, MissingLibraryError, said
 
 from .log.units import QUATERNION, Rows, Summary, of_kinds
 
@@ -102,8 +102,7 @@ def read_bag(
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = {c.topic: c.msgtype in READ and c.topic not in ignore for c in reader.connections}
             for topic in filter(None, [truth, *(name for name in ignore if name.startswith("/"))]):
-                if topic not in topics:
-                    raise unknown(f"{path.name}: topic", topic, sorted(topics))
+                one_of(f"{path.name}: topic", topic, sorted(topics))
             wanted = [c for c in reader.connections if topics[c.topic]]
             what, fields = {}, {}
             for c in wanted:
@@ -124,8 +123,7 @@ def read_bag(
         for topic, table in messages.items():
             frame = pd.DataFrame(table, columns=["number", "t", *fields[topic]]).set_index("number")
             for field in frame.columns[frame.columns.str.endswith("covariance")]:
-                matrix = pd.DataFrame(np.stack(frame[field].tolist()), frame.index)
-                frame = frame.join(matrix.add_prefix(f"{field}_"))
+                frame = frame.join(pd.DataFrame(np.stack(frame[field].tolist()), frame.index).add_prefix(f"{field}_"))
             (vehicle, partner), true = of[topic]
             kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
             rows = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), path.name)

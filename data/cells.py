@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats, named, number
+from coopoc.arrays import Bools, Floats, named, number, one_of
 from coopoc.errors import InputError, said, suggestion, unknown
 from coopoc.formats.values import MAX_NUMBER
 
@@ -202,8 +202,7 @@ def factors(mapping: Mapping[str, float] | None, names: Collection[str], field: 
     """Numbers by name; InputError for a name that is none of `names`, for 0, and for a deviation or a scale of times
     that is not positive."""
     for name, value in named(field, mapping or {}, f"Give {field}={{name: number}}.").items():
-        if name not in names:
-            raise unknown(field, name, names)
+        one_of(field, name, names)
         least = 1e-12 if field == "std" or name == "t" else -MAX_NUMBER
         allowed = f"a finite number other than 0{', and > 0' * (least > 0)}"
         if not number(f"{field} of {name}", value, least, MAX_NUMBER, allowed=allowed):
@@ -217,8 +216,7 @@ def words(frame: "pd.DataFrame", column: str, file: str) -> list[str]:
     named_cells = filled(cells)
     _refuse(cells.astype(object).where(named_cells, "empty"), ~named_cells, file, "must be a name")
     number, each = cells.astype(str).factorize()
-    names: list[str] = np.array([WHOLE.sub(r"\1", cell.strip()) for cell in each], dtype=object)[number].tolist()
-    return names
+    return list(np.array([WHOLE.sub(r"\1", cell.strip()) for cell in each], dtype=object)[number].tolist())
 
 
 def filled(cells: "pd.Series[Any]") -> Bools:

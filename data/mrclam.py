@@ -129,14 +129,8 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         licence="none stated: read, not redistributed",
         heading=poses[..., 2],
     )
-    return MrclamLog(
-        fleet=fleet,
-        speed=odometry[..., 0],
-        turn_rate=odometry[..., 1],
-        landmarks=marks,
-        relative=table,
-        true=np.column_stack([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2])]),
-    )
+    true = np.column_stack([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2])])
+    return MrclamLog(fleet, odometry[..., 0], odometry[..., 1], marks, table, true)
 
 
 class Calibration(NamedTuple):
@@ -293,12 +287,13 @@ def _measurements(folder: Path, numbers: list[int]) -> Floats:
     for column, what in ((1, "barcode"), (0, "subject")):
         twice = pd.Series(codes[:, column]).duplicated().to_numpy()
         _refuse(file, twice, f"must give each {what} once", "Remove the line that repeats it.")
-    subject_of = {code: subject for subject, code in codes.tolist()}
+    subjects, barcodes = codes.T
+    subject_of = pd.Series(subjects, barcodes)
     parts = []
     for column, robot in enumerate(numbers):
         file = folder / f"Robot{robot}_Measurement.dat"
         table = _read(file, "time barcode range bearing")
-        subject = np.array([subject_of.get(code, 0) for code in table[:, 1].tolist()])
+        subject = subject_of.reindex(table[:, 1], fill_value=0.0).to_numpy()
         hint = "Check Barcodes.dat, or remove the line."
         _refuse(file, subject == robot, "must be another's: a robot does not measure itself", hint)
         _refuse(file, table[:, 2] <= 0, "must have a range > 0 m", "Remove the line.")

@@ -32,8 +32,7 @@ def card(name: str) -> dict[str, Any]:
     >>> card("town10")["neighbours"]["mean"] > 5
     True
     """
-    made: dict[str, Any] = json.loads((FLEETS / f"{name}.json").read_text("utf-8"))
-    return made
+    return dict(json.loads((FLEETS / f"{name}.json").read_text("utf-8")))
 
 
 def in_words(facts: dict[str, Any]) -> dict[str, str]:

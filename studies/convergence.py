@@ -15,7 +15,7 @@ from coopoc.study.study import Params, Row
 from coopoc.study.style import CLIENTS, Panel, look
 
 from . import lineup, scene, weights
-from .views import Plot, curves, table
+from .views import Plot, curves, ran_at, table
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
 BOTH = {"method": [FEDERATED, CENTRALISED]}
@@ -62,7 +62,7 @@ def meaningful(p: Params) -> bool:
 
 def _curve(results: Results, method: str) -> list[float]:
     """Mean RT-LE after every round; empty if the net was not run."""
-    rounds = sorted({*results.frame.get("round", ())})
+    rounds = ran_at(results, "round")
     return [*ran({number: mean(results, {"method": method, "round": number}) for number in rounds}).values()]
 
 
@@ -73,7 +73,7 @@ def _seeds(results: Results, where: Where) -> Interval | None:
 
 
 def _figure(results: Results) -> "Plot | None":
-    rounds = sorted({*results.frame.get("round", ())})
+    rounds = ran_at(results, "round")
     ticks = {number: str(number) for number in rounds if number % 5 == 0}
     panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round", ticks=ticks)
     text = (

@@ -3,17 +3,17 @@
 import hashlib
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from coopoc import V2X, Fleet, InputError, Links, Recording, pose_start
+from coopoc import V2X, Fleet, InputError, Recording, pose_start
 from coopoc.arrays import Floats, number
 from coopoc.data.fetch import bring
-from coopoc.data.log.links import under
+from coopoc.data.log.links import under, with_links
 from coopoc.data.log.read import Log
 from coopoc.data.log.residuals import GATE_STDS, begin_of, together
 from coopoc.data.mrclam import calibrate, pose_recording, read_mrclam, surveyed
@@ -148,6 +148,11 @@ def _logged(log: Log, span: str) -> Source:
     return Source(log.recording.t, *counts, posed, digests, lru_cache(maxsize=2)(drive), lambda until: begun(), text)
 
 
+def near(k: int, loss: float = 0.0) -> V2X:
+    """The K nearest vehicles that were seen, and the losses of their messages."""
+    return V2X(max_neighbours=k, radius=float("inf"), loss=loss)
+
+
 def calibrated(p: Params) -> float:
     """s of the first part, which calibrates and starts: of the settings, else 40 % of the drive, 300 s at most.
 
@@ -202,5 +207,4 @@ def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
     chosen = marks[(every * np.arange(landmarks)).astype(np.int64)]
     links = recording.links
     gone = np.isin(links.neighbour, marks) & ~np.isin(links.neighbour, chosen) & (links.step >= start)
-    fewer = Links(links.step[~gone], links.observer[~gone], links.neighbour[~gone])
-    return replace(recording, links=fewer, relative=recording.relative[:, ~gone], arrival=recording.arrival[:, ~gone])
+    return with_links(recording, ~gone)

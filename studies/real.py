@@ -20,9 +20,9 @@ from coopoc.study.style import Panel, look, words
 from coopoc.study.tables import Table, crossed, unused
 
 from . import pose_drives as drives
-from .pose_drives import Drive, thinned
-from .scene import CODE
-from .views import Plot
+from .pose_drives import Drive, near, thinned
+from .scene import CODE, counted
+from .views import Plot, ran_at
 
 FLEET, *DECENTRALISED = FLEET_METHODS = ("pose-fleet", "pose-intersection", "pose-naive")
 """Pose filters of a fleet in body frames."""
@@ -65,11 +65,6 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
     counted = np.isfinite(first.gnss[:, :, who, :2]).sum() + np.isfinite(first.relative[..., :2]).sum()
     sent = 4.0 * (2 * steps + float(counted) / len(who))
     return {ALONE: (own, 0.0), FEDERATED: ([mean], 8.0 * len(logs[0])), CENTRAL: ([whole], sent)}
-
-
-def near(k: int, loss: float = 0.0) -> V2X:
-    """The K nearest vehicles that were seen, and the losses of their messages."""
-    return V2X(max_neighbours=k, radius=float("inf"), loss=loss)
 
 
 def channel(p: Params) -> V2X:
@@ -191,11 +186,6 @@ def _caption(results: Results, text: str) -> str:
     return " ".join(parts)
 
 
-def _run(results: Results, axis: str) -> list[int]:
-    """The numbers of neighbours or of landmarks that were run."""
-    return sorted({*results.frame.get(axis, ())})
-
-
 def _table(results: Results, value: str, text: str, **options: Any) -> Table | None:
     """A metric of all methods, by K and landmarks, and the bytes that a vehicle sends."""
     if present(results, {}, value) is None:
@@ -216,16 +206,16 @@ BYTES = (
 
 
 def _rows(results: Results) -> list[tuple[tuple[int, str], Where]]:
-    ks = _run(results, "max_neighbours")
+    ks = ran_at(results, "max_neighbours")
     return [((k, look(name).label), {"method": name, "max_neighbours": k}) for k in ks for name in EVERY]
 
 
 def _columns(results: Results) -> dict[str, Where]:
-    return {f"{words('landmarks')} = {n}": {"landmarks": n} for n in _run(results, "landmarks")}
+    return {f"{words('landmarks')} = {n}": {"landmarks": n} for n in ran_at(results, "landmarks")}
 
 
 def _sent(results: Results, where: Where) -> int | None:
-    sent = mean(results, {"landmarks": _run(results, "landmarks")[-1], **where}, "sent_bytes")
+    sent = mean(results, {"landmarks": ran_at(results, "landmarks")[-1], **where}, "sent_bytes")
     return None if sent is None else round(sent)
 
 
@@ -256,10 +246,10 @@ def _trade(results: Results) -> "Plot | None":
 
     places = {max(_sent(results, where) or 0.0, 1.0 + 0.3 * i): {"at": i} for i, where in enumerate(each)}
     marks, ticks = (
-        [n for n in _run(results, "landmarks") if n <= COMPARED_LANDMARKS],
+        [n for n in ran_at(results, "landmarks") if n <= COMPARED_LANDMARKS],
         {1.0: "0", 1e2: "100", 1e4: "10 k", 1e6: "1 M"},
     )
-    panels = [Panel(places, {"landmarks": n}, _landmarks(n), "Sent [B]", ticks) for n in marks]
+    panels = [Panel(places, {"landmarks": n}, counted(n, "landmark"), "Sent [B]", ticks) for n in marks]
     looks = ("Cooperating", "#0072B2", "s"), ("Training", "#D55E00", "o"), ("Both", "#009E73", "D")
     lines = [
         {"kind": k, "label": label, "color": color, "marker": mark, "linestyle": "none"}
@@ -276,7 +266,7 @@ def _findings(results: Results) -> list[str]:
     def of(k: int, n: int, value: str = "rt_le_m") -> float | None:
         return mean(results, {**BASE, "max_neighbours": k, "landmarks": n}, value)
 
-    ks, marks = _run(results, "max_neighbours"), _run(results, "landmarks")
+    ks, marks = ran_at(results, "max_neighbours"), ran_at(results, "landmarks")
     if not ks:
         return []
     texts = []
@@ -285,7 +275,7 @@ def _findings(results: Results) -> list[str]:
         together = of(k, 0)
         if not k or together is None or 0 not in alone:
             continue
-        each = ", ".join(f"with {_landmarks(n)} {value:.3g} m" for n, value in alone.items())
+        each = ", ".join(f"with {counted(n, 'landmark')} {value:.3g} m" for n, value in alone.items())
         texts.append(f"K = {k} without a landmark: {together:.3g} m; alone {each}.")
     nees = list(ran({(k, n): of(k, n, "nees") for k in ks for n in marks}).values())
     if nees:
@@ -293,10 +283,6 @@ def _findings(results: Results) -> list[str]:
         doubt = " Units, axes or stated noise do not fit the drive: coopoc data check shows the residuals of each kind."
         texts.append(f"{text}, {max(nees):.1f} at most.{doubt * (min(nees) > UNFIT)}")
     return texts
-
-
-def _landmarks(number: int) -> str:
-    return "1 landmark" if number == 1 else f"{number} landmarks"
 
 
 STUDY = Study(

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Method, Recording, Sensors, observe, read_log
-from coopoc.arrays import AnyArray, Floats, last_true
+from coopoc.arrays import last_true
 from coopoc.data.log.read import is_log
+from coopoc.data.log.residuals import in_space, plane
 from coopoc.data.source import split
 from coopoc.study.study import Row
 from coopoc.world.recording import NOTHING_SIMULATED
@@ -57,8 +58,6 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         InputError: a file that is missing, a log without a truth.
     """
     files = [located(data, name) for name in roads(data)[task]]
-    if task in PUBLISHED:
-        return published(files[0])
     if task == "kitti":  # poses 3x4 of a camera (x right, z ahead) in the plane, and fixes of 2.5 m that are drawn once
         poses = map(np.loadtxt, files)
         ways = [np.column_stack([pose[:, 11], pose[:, 3], 0.0 * pose[:, 3]])[:, None] for pose in poses]
@@ -68,11 +67,13 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         notes = (f"odometry: {NOTHING_SIMULATED}",)
         recording = replace(drawn, velocity=measured[None], sensors=Sensors(), notes=notes)
     else:
-        options = {"truth": files[1]} if files[1:] else {"dt": COMMA_STEP} if files else {}
+        options = {"truth": files[1]} if files[1:] else {"dt": COMMA_STEP} if files and task in ROADS else {}
         log = read_log(files[0] if files else str(data), **options)
         if log.truth is None:
             raise InputError("data", str(data), "must hold a truth", 'Name its file: "LOG?truth=FILE".')
         recording, truth = log.recording, log.truth
+    if task in PUBLISHED:
+        return recording, truth
     clock, gnss = (recording.t - recording.t[0]) % PERIOD_SECONDS, recording.gnss.copy()
     for column in range(len(recording.ids)):
         kept = np.flatnonzero(np.isfinite(gnss[0, :, column, 0]))[::FIX_EVERY]
@@ -80,13 +81,6 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         gone = np.setdiff1d(np.arange(len(clock)), [*kept[clock[kept] < PERIOD_SECONDS - OUTAGE_SECONDS], *starts])
         gnss[:, gone, column] = np.nan
     return replace(recording, gnss=gnss), truth
-
-
-def published(file: Path) -> tuple[Recording, Fleet]:
-    """Drives with all their fixes, and their truth."""
-    log = read_log(file)
-    assert log.truth is not None
-    return log.recording, log.truth
 
 
 def road_row(task: str, data: Path | None, made: Method) -> Row:
@@ -102,9 +96,8 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
     files = [located(data, name) for name in roads(data)[task]]
-    row = {"task": task, "data": hashed(*files)}
-    row |= _scored(made, recording, truth, start)
-    return row | {"received_bytes_per_second": 0}
+    scored = _scored(made, recording, truth, start)
+    return {"task": task, "data": hashed(*files), **scored, "received_bytes_per_second": 0}
 
 
 def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> Row:
@@ -158,24 +151,24 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     starts, length = _pieces(recording, column)
     there = np.isfinite(truth.position[:, column, 0])
     now = np.arange(len(there))
-    path = np.interp(now, now[there], truth.position[there, column] @ [1, 1j, 0])
+    path = np.interp(now, now[there], plane(truth.position[there, column]))
     motion = np.diff(path, prepend=path[0])
-    measured = recording.velocity[0, :, column] @ np.array([1, 1j, 0]) * dt
+    measured = plane(recording.velocity[0, :, column]) * dt
     fast = (np.abs(motion) > MIN_COURSE_SPEED * dt) & np.isfinite(measured)
     last = np.maximum(last_true(fast), np.argmax(fast))  # where the vehicle is slow, the ratio is as before
     times = (np.where(fast, measured, 1.0) / np.where(fast, motion, 1.0))[last]
     ratio = np.clip(np.abs(times), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(times), -0.5, 0.5))
-    error = recording.gnss[0, :, column] @ np.array([1, 1j, 0]) - path
+    error = plane(recording.gnss[0, :, column]) - path
     route, rows = slice(starts[0], starts[0] + length), np.array(starts) + np.arange(length)[:, None]
     offset = START_SPREAD * np.random.default_rng(SEED).uniform(-1, 1, (len(starts), 2)) @ [1, 1j] / np.sqrt(2)
     true = (path[route] - path[starts[0]])[:, None] + offset
     driven = np.repeat(motion[route, None], len(starts), axis=1)
     ids, t = tuple(f"v{k}" for k in range(len(starts))), recording.t[:length] - recording.t[0]
-    fleet = Fleet(ids, t, _plane(true), _plane(driven) / dt, name=task)
+    fleet = Fleet(ids, t, in_space(true), in_space(driven) / dt, name=task)
     v2x = V2X(max_neighbours=neighbours, radius=150.0)
     drawn = observe(fleet, recording.sensors, v2x, runs=RUNS, seed=SEED)
     gnss, velocity = (
-        np.tile(each, (RUNS, 1, 1, 1)) for each in (_plane(true + error[rows]), _plane(ratio[rows] * driven) / dt)
+        np.tile(each, (RUNS, 1, 1, 1)) for each in (in_space(true + error[rows]), in_space(ratio[rows] * driven) / dt)
     )
     return replace(
         drawn, gnss=gnss, velocity=velocity, notes=(f"errors of fixes and odometry: {NOTHING_SIMULATED}",)
@@ -190,11 +183,6 @@ def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
     starts = [int(fixes[np.searchsorted(fixes, np.ceil(first))]) for first in wanted]
     ends = [*starts[1:], len(recording.t)]
     return starts, min(end - start for start, end in zip(starts, ends, strict=True))
-
-
-def _plane(values: AnyArray) -> Floats:
-    """(..., 3) of complex numbers east + i north, NaN in the height, too, where there is none."""
-    return np.stack([values.real, values.imag, 0.0 * values.real], axis=-1)
 
 
 def convoy_row(task: str, data: Path | None, method: Method) -> Row:

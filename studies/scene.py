@@ -108,9 +108,9 @@ def _there(data: str) -> Bools:
     log = _log(data)
     if log is None:
         return fleet(data).present
-    velocity, started = log.recording.velocity[0], np.isfinite(log.recording.gnss[0, :, :, 0])
+    started = np.isfinite(log.recording.gnss[0, :, :, 0])
     there: Bools = log.recording.present & np.maximum.accumulate(started, axis=0)
-    standing = (np.nan_to_num(velocity) == 0).all(axis=(0, 2))
+    standing = (np.nan_to_num(log.recording.velocity[0]) == 0).all(axis=(0, 2))
     if not standing.all():
         there &= ~standing  # a road-side unit knows where it is
     return there if log.truth is None else there & log.truth.present
@@ -189,8 +189,8 @@ def conditions(p: Params) -> str:
     log = _log(p["data"])
     runs = log.recording.runs if log is not None and (log.messages or not channel(p).loss) else p["runs"]
     name, there = Path(split(p["data"])[0]).name, _there(p["data"]).any(axis=0).sum()
-    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {name} ({_count(there, 'vehicle')})"
-    trained = f", {_count(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
+    size = f"{counted(runs, 'run')}, {counted(len(who), 'ego')} of {name} ({counted(there, 'vehicle')})"
+    trained = f", {counted(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."
 
 
@@ -227,7 +227,12 @@ def caption(results: "Results", *texts: str, **at: Any) -> str:
     return " ".join([*(text.format(**p) for text in texts), conditions(p)])
 
 
-def _count(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """A number of things in words.
+
+    >>> counted(1, "run"), counted(0, "ego")
+    ('1 run', '0 egos')
+    """
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 

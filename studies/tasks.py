@@ -38,7 +38,7 @@ from coopoc.study.study import Row
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
-from .pose_drives import POSES, hashed
+from .pose_drives import POSES, hashed, near
 
 VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
@@ -69,10 +69,10 @@ class Task:
     egos: int = 5
 
     @property
-    def columns(self) -> tuple[int, ...]:
+    def columns(self) -> list[int]:
         """Egos as columns of the fleet."""
         count = len(load_fleet(self.data).ids)
-        return tuple(k * count // self.egos for k in range(self.egos))
+        return [k * count // self.egos for k in range(self.egos)]
 
 
 WHITE = Sensors.paper_scenario2()
@@ -108,14 +108,12 @@ VALIDATION = tuple(replace(task, data="town10-validation", seed=1) for task in T
 def recording(task: Task, everyone: bool, remove_outliers: bool = False) -> tuple[Recording, Fleet]:
     """What a task's vehicles see, with what is wrong in it or `remove_outliers` of it, and the truth."""
     fleet = load_fleet(task.data)
-    egos = None if everyone else list(task.columns)
+    egos = None if everyone else task.columns
     observed = observe(
         fleet, task.sensors, task.v2x, runs=task.runs, seed=task.seed, observers=egos, remove_outliers=remove_outliers
     )
     if task.attack.share:
-        observed = spoofed(
-            observed, task.attack, seed=task.seed, honest=list(task.columns), remove_outliers=remove_outliers
-        )
+        observed = spoofed(observed, task.attack, seed=task.seed, honest=task.columns, remove_outliers=remove_outliers)
     return observed, fleet
 
 
@@ -134,7 +132,7 @@ def bound(task: Task, information: str) -> float:
         runs = 3 if information in ("past", "fleet") else task.runs  # each takes half a minute
         clean, _ = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)
     if information == "fleet":
-        bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, list(task.columns)], 1, 0)]
+        bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, task.columns], 1, 0)]
     else:
         near, past = V2X(0) if information == "solo" else v2x, information == "past"
         bounds = [posterior_bound(fleet, sensors, ego, near, past=past, recording=clean) for ego in task.columns]
@@ -174,8 +172,8 @@ def located(folder: Path | None, name: str) -> Path:
 def observed_task(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
     if task.startswith("robots"):
-        until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
-        drive = pose_drives.source(str(path)).drive(until, v2x)
+        until = 300.0
+        drive = pose_drives.source(str(path)).drive(until, near(4))
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
@@ -186,7 +184,7 @@ def observed_task(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
         begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE_STDS)
         return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
-    drive = pose_drives.source(str(path)).drive(0.0, V2X(max_neighbours=3, radius=float("inf")))
+    drive = pose_drives.source(str(path)).drive(0.0, near(3))
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
     noise = replace(drive.recording.sensors, range_std=RANGE_STD)

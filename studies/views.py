@@ -25,6 +25,11 @@ def of(method: str, noise_model: str, /, **at: Any) -> dict[str, Any]:
     return {**at, "method": method, "noise_model": noise_model}
 
 
+def ran_at(results: Results, axis: str) -> list[int]:
+    """The numbers of a setting, such as one of neighbours, that were run."""
+    return sorted({*results.frame.get(axis, ())})
+
+
 def table(
     *texts: str,
     value: str = "rt_le_m",

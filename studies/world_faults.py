@@ -114,8 +114,7 @@ def _scale(scene: Scene, rng: Draws, stated: bool) -> Made:
         scale = 1.0 + std * _normals(recording, scene.seed, "speed_scale")
         return replace(recording, velocity=recording.velocity * scale[:, None, :, None])
 
-    assumed_sensors = replace(scene.assumed, speed_scale_std=std) if stated else scene.assumed
-    return replace(scene, assumed=assumed_sensors).edited(edit), f"{100 * std:.2g} %"
+    return scene.sensing(stated, speed_scale_std=std).edited(edit), f"{100 * std:.2g} %"
 
 
 def _normals(recording: Recording, seed: int, sensor: str) -> Floats:
@@ -127,16 +126,13 @@ def _slip(scene: Scene, rng: Draws) -> Made:
     """Wheels of the egos and of a third of the others, twice as fast or still."""
     (when, words), factor = scene.interval(rng, 2.0, 10.0), float(rng.choice((0.0, 2.0)))
     who = np.union1d(scene.egos, scene.others[rng.uniform(size=len(scene.others)) < 1 / 3])
-
-    def edit(recording: Recording) -> Recording:
-        return replace(recording, velocity=np.where(_during(recording, when, who), factor, 1.0) * recording.velocity)
-
-    return scene.edited(edit), f"velocities times {factor:g}, {words}"
+    return scene.edited(partial(_times, "velocity", factor, when, who)), f"velocities times {factor:g}, {words}"
 
 
-def _during(recording: Recording, when: Bools, columns: Ints | tuple[int, ...]) -> Bools:
-    """(T, N, 1) True of some vehicles at some steps."""
-    return (when[:, None] & np.isin(np.arange(len(recording.ids)), columns))[..., None]
+def _times(field: str, factor: float, when: Bools, who: Ints | tuple[int, ...], recording: Recording) -> Recording:
+    """Fixes or velocities of some vehicles at some steps, times a factor."""
+    factors = np.where(when[:, None] & np.isin(np.arange(len(recording.ids)), who), factor, 1.0)
+    return replace(recording, **{field: factors[..., None] * getattr(recording, field)})
 
 
 def _outage(scene: Scene, rng: Draws, start: bool) -> Made:
@@ -145,11 +141,7 @@ def _outage(scene: Scene, rng: Draws, start: bool) -> Made:
     if start:
         until = rng.uniform(10.0, 40.0)
         when, words = (scene.fleet.t > 0) & (scene.fleet.t < until), f"until {until:.0f} s"
-
-    def edit(recording: Recording) -> Recording:
-        return replace(recording, gnss=np.where(_during(recording, when, scene.egos), np.nan, recording.gnss))
-
-    return scene.edited(edit), words
+    return scene.edited(partial(_times, "gnss", np.nan, when, scene.egos)), words
 
 
 def _receiver(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), start: float | None = None) -> Made:

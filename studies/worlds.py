@@ -10,7 +10,6 @@ import numpy as np
 
 from coopoc import V2X, Fleet, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, number, one_of
-from coopoc.errors import unknown
 from coopoc.world.body_frames import turned
 
 from .world_faults import EGOS, KINDS, OF_MOTION, OF_NEIGHBOURS, RUNS, WEIGHTS, Draws, Scene, log_uniform
@@ -64,8 +63,7 @@ def world(seed: int, split: Split = "test", *, without: Collection[str] = (), ev
     seed = number("seed", seed, 0, 2**30, kind=int, allowed="in 0..2^30", hint="Count worlds from 0.")
     key = 3 * seed + SPLITS.index(one_of("split", split, Split))
     for kind in without:
-        if kind not in KINDS:
-            raise unknown("without", kind, KINDS)
+        one_of("without", kind, KINDS)
     scene = _nominal(key, split)
     kinds = [kind for kind in _kinds(_rng(key, "kinds"), scene) if kind not in without]
     texts = [_text(scene)]
@@ -182,14 +180,14 @@ def _circle(rng: Draws, t: Floats, _: Split) -> Floats:
     count, radius, speed = int(rng.integers(4, 11)), rng.uniform(12.0, 45.0), rng.uniform(3.0, 12.0)
     ring = radius + rng.uniform(-3.0, 3.0, count)
     angle = speed / radius * t[:, None] + 2 * np.pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count
-    return _points(ring * np.cos(angle), ring * np.sin(angle), _heights(rng, count))
+    return _points(rng, ring * np.cos(angle), ring * np.sin(angle))
 
 
 def _crossing(rng: Draws, t: Floats, _: Split) -> Floats:
     count = int(rng.integers(8, 17))
     speed, passes = rng.uniform(4.0, 12.0, count), np.sort(rng.uniform(0.0, t[-1], count))
     along, side = speed * (t[:, None] - passes), rng.uniform(2.0, 6.0, count)
-    lane = _points(along, side, _heights(rng, count))
+    lane = _points(rng, along, side)
     return turned(lane, np.broadcast_to(np.pi / 2 * rng.integers(0, 4, count), along.shape))
 
 
@@ -197,16 +195,12 @@ def _standing(rng: Draws, t: Floats, _: Split) -> Floats:
     count = int(rng.integers(3, 11))
     grid = np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2)
     position = rng.uniform(5.0, 9.0) * rng.permutation(grid)[:count] + rng.uniform(-1.0, 1.0, (count, 2))
-    return np.tile(np.column_stack([position, _heights(rng, count)]), (len(t), 1, 1))
+    return _points(rng, *np.broadcast_to(position.T[:, None], (2, len(t), count)))
 
 
-def _points(*axes: Floats) -> Floats:
-    """(T, N, 3) of coordinates that broadcast."""
-    return np.stack(np.broadcast_arrays(*axes), axis=-1)
-
-
-def _heights(rng: Draws, count: int) -> Floats:
-    return rng.uniform(-2.0, 2.0, count)
+def _points(rng: Draws, x: Floats, y: Floats) -> Floats:
+    """(T, N, 3) of x (T, N) and a y that broadcasts, at heights that are drawn."""
+    return np.stack(np.broadcast_arrays(x, y, rng.uniform(-2.0, 2.0, x.shape[1])), axis=-1)
 
 
 DRIVES: Mapping[str, Callable[[Draws, Floats, Split], Floats]] = {

@@ -100,8 +100,11 @@ def check(log: Log) -> Check:
     first = without_wild(replace(first, failing=_failing(first) if log.recording.body is None else {}))
     rows = _vehicles(first)
     least = {"speed_excess": LEAST_SCALE, "turned": LEAST_TURN, "yaw_rate_bias": LEAST_DRIFT, "fixes_late_s": BEHIND}
-    err = [row["vehicle"] in first.failing or any(_beyond(row, *one) for one in least.items()) for row in rows]
-    drifts = [first.world.ids.index(row["vehicle"]) for row, errs in zip(rows, err, strict=True) if errs]
+    drifts = [
+        first.world.ids.index(row["vehicle"])
+        for row in rows
+        if row["vehicle"] in first.failing or any(_beyond(row, *one) for one in least.items())
+    ]
     alike = not drifts and not any(_beyond(row, "nis", OUTLYING) for row in rows)
     late = [row["vehicle"] for row in rows if _late(first, row)]
     result = on_time(first if log.recording.body else without(first, drifts), alike, against_truth(first, late))
@@ -423,10 +426,8 @@ def _of_fixes(c: Check) -> Iterator[str]:
                 "are so), or files of two drives."
             )
             continue
-        if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND):
-            continue
-        if truth is None or arm:  # what draws aside draws along a bend, too
-            continue
+        if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND) or truth is None or arm:
+            continue  # an arm, which draws aside, draws along a bend, too
         if sure[2] and abs(lag := factor[2]) >= LEAST_LAG:
             way = "ahead of" if lag > 0 else "behind"
             yield (

@@ -13,7 +13,7 @@ from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
 
 from .motion import COURSE, MOVING, OF_FASTEST
-from .residuals import Check, distances, filtered, plane, residual_of
+from .residuals import Check, distances, filtered, in_space, plane, residual_of
 
 SURE_ERRORS, SURE_CLOCK_ERRORS = 4.0, 5.0
 """Standard errors beyond which an estimate is significant, of many in a few logs; and one of clocks and ranges."""
@@ -61,6 +61,11 @@ class Estimate(NamedTuple):
     error: Floats
 
 
+def no_estimate(count: int) -> Estimate:
+    """Of so many numbers, which nothing shows."""
+    return Estimate(np.zeros(count), np.full(count, np.inf))
+
+
 def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, z: AnyArray | None = None) -> Estimate:
     """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, less the means of groups (M,);
     and standard errors, as leaving out each part of the drive changes them. None is known where half of y stays, and
@@ -72,7 +77,7 @@ def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, 
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
-    none, seen = Estimate(np.zeros(x.shape[1]), np.full(x.shape[1], np.inf)), np.any(x, axis=0)
+    none, seen = no_estimate(x.shape[1]), np.any(x, axis=0)
     all_of, k = np.column_stack([y, x[:, seen], (x if z is None else z)[:, seen]]), int(seen.sum())
     if len(y) < MIN_SAMPLES:
         return none
@@ -133,7 +138,7 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
         return plane(rec.gnss[0] - truth.position), made, made
     then = np.nan_to_num(following(c, made, axis=1))
     for k, cause in enumerate(np.nan_to_num(NUDGE_STEP * made)):
-        gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
+        gnss = c.log.recording.gnss + in_space(cause)
         moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
         made[k] = plane(moved.fix - c.fix) / NUDGE_STEP
     return plane(c.fix), made, then
@@ -193,7 +198,7 @@ def odometry(c: Check, column: int) -> Estimate:
     m/s east and north.
     """
     rec, truth, body = c.world, c.log.truth, c.log.recording.body
-    none = Estimate(np.zeros(5), np.full(5, np.inf))
+    none = no_estimate(5)
     if c.shown(column):
         return none
     velocity = rec.velocity[0, :, column, :2]
@@ -203,10 +208,11 @@ def odometry(c: Check, column: int) -> Estimate:
         none.error[0] = np.hypot(none.error[0], np.square(noise).sum() / max(np.nansum(np.square(velocity)), 1e-12))
         return none
     if truth is None:
-        moved, driven, turns, bends, span = moves(c, column)
-        if len(moved) < LEAST_COUNT:
+        each = moves(c, column)
+        if each.shape[1] < LEAST_COUNT:
             means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2)
-            moved, driven, turns, bends, span = moves(c, column, max(means, 1))
+            each = moves(c, column, max(means, 1))
+        moved, driven, turns, bends, span = each
         square = max(np.square(np.abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
         y = moved - driven
@@ -254,7 +260,7 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
     """Factors (5,) by which causes x (K, M), a size, a turn, a lag and what else may be, explain y (M,), and a constant
     velocity that is made of `constant` (M,). What is within two standard errors is left out, the constant first, and
     what looks like another cause, which make up all but MIN_OWN_SHARE of it, as a lag does on a bend at one speed."""
-    value, error = np.zeros(5), np.full(5, np.inf)
+    made = no_estimate(5)
     for causes, extra in ((np.concatenate([x, [constant, 1j * constant]]), [-2, -1]), (x, [2]), (x[:2], [])):
         unit = np.concatenate([causes.real, causes.imag], axis=1)
         unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
@@ -265,11 +271,11 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
         if np.linalg.norm(explained.value[extra]) >= 2.0 * np.linalg.norm(explained.error[extra]):
             break
     of_causes = min(len(causes), 3)
-    for whole, part in zip((value, error), explained, strict=True):
+    for whole, part in zip(made, explained, strict=True):
         whole[:of_causes] = part[:of_causes]
         if len(extra) == 2:
             whole[3:] = part[extra]
-    return Estimate(value, error)
+    return made
 
 
 def _polar(turned: complex) -> Floats:
@@ -297,8 +303,8 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
         along = (gap * moves).sum(axis=1) / far
         across = (gap[:, 0] * moves[:, 1] - gap[:, 1] * moves[:, 0]) / flat**2
         rate = (gap * (velocity[links.step, links.observer] - moves)).sum(axis=1) / far
-        made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
-        return np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
+        of_range = np.column_stack([along[:, None] * ends, far, rate])
+        return np.stack([of_range, np.pad(across[:, None] * ends, ((0, 0), (0, 2)))], axis=1)
 
     velocity = np.nan_to_num(c.world.velocity[0])
     used = (which < size + 2 * alike) & (which != reference)
@@ -307,7 +313,7 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
     x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
-    value, error = np.zeros(size + 2), np.full(size + 2, np.inf)
+    value, error = no_estimate(size + 2)
     value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z)
     measured = np.unique(pairs[:, there])
     stay = max(noise**2 - c.world.sensors.range_std**2, 0.0) * share(c) / max(len(measured), 1)

@@ -173,7 +173,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
         origin = latitude, longitude, height
     metres = np.column_stack(pymap3d.geodetic2enu(*fixes.to_numpy().T, *origin))
     enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
-    value = rows["value"].mask(geodetic, enu.reindex(pd.MultiIndex.from_frame(rows[keys])).to_numpy())
+    value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(keys).index).to_numpy())
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
 
 
@@ -183,7 +183,7 @@ def _by_attitude(rows: Rows, summary: Summary) -> Rows:
     turns = rows["kind"].isin(QUATERNION)
     if not turns.any():
         return rows
-    index = pd.MultiIndex.from_frame(rows[["vehicle", "t", "kind"]])
+    index = rows.set_index(["vehicle", "t", "kind"]).index
     table = rows["value"].set_axis(index)[~index.duplicated()].unstack().reindex(columns=[*BODY, *QUATERNION])
     unit = abs(np.linalg.norm(table[QUATERNION], axis=1) - 1.0) < QUATERNION_ROUNDING
     table.loc[~unit, QUATERNION] = np.nan
@@ -219,27 +219,22 @@ def _nowhere(rows: Rows) -> Bools:
     return rows.set_index(key).index.isin(none) & in_group(rows, "fix")
 
 
-def assumed(
-    rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: "Sequence[Member]", drifts: float
-) -> Sensors:
+def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: float) -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
 
     Args:
         rows: in SI units and metres.
-        planar: whether no height was logged.
-        body: whether the recording is in body frames.
-        summary: takes what is assumed.
-        dt: s, of the recording.
+        steps: of the recording, whose summary takes what is assumed.
         members: of the log.
         drifts: m^2/s, by which the vehicle that wanders least does, as fixes have shown its velocity.
     """
-    base, used = Sensors(), set(rows["kind"])
+    base, used, body, summary, dt = Sensors(), set(rows["kind"]), steps.body, steps.summary, steps.dt
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
     rare = _apart(rows, MOTION, dt) ** 0.5  # the error of a motion that is measured seldom lasts until the next
 
-    def of(*names: str, default: float, unit: str) -> float:
+    def of(default: float, unit: str, *names: str) -> float:
         stated = stated_std(rows, *names)
         if stated > 0.0:
             return stated
@@ -248,23 +243,23 @@ def assumed(
         return default
 
     x, y, z = base.gnss_std
-    up = PLANE_STD if planar else of("z", default=z, unit="m")
+    up = PLANE_STD if steps.planar else of(z, "m", "z")
     noise: dict[str, Any] = {
-        "gnss_std": (of("x", default=x, unit="m"), of("y", default=y, unit="m"), up),
-        "range_std": of("range", default=base.range_std, unit="m"),
+        "gnss_std": (of(x, "m", "x"), of(y, "m", "y"), up),
+        "range_std": of(base.range_std, "m", "range"),
         "range_offset_std": OFFSET_STD * ("range" in used),
-        "azimuth_std": of("azimuth", "bearing", default=base.azimuth_std, unit="rad"),
-        "inclination_std": of("inclination", default=PLANE_STD if planar else base.inclination_std, unit="rad"),
+        "azimuth_std": of(base.azimuth_std, "rad", "azimuth", "bearing"),
+        "inclination_std": of(PLANE_STD if steps.planar else base.inclination_std, "rad", "inclination"),
         "min_range": 0.0,
     }
     if body:
-        rate = rare * of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
+        rate = rare * of(base.yaw_rate_std, "rad/s", "yaw_rate")
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
         noise["velocity_bias_std"] = VELOCITY_BIAS_STD * ("vy_body" in used)
     derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], axis=0).tolist()
     if body or ("heading" in square and "bearing" in used):
-        noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
+        noise["heading_std"] = of(HEADING_STD, "rad", "heading")
     elif derived and "bearing" in used:
         noise["heading_std"] = derived
         summary.assume(f"{derived:.2g} rad as the noise of derived headings, which rotate bearings")
@@ -275,7 +270,7 @@ def assumed(
         )
     ratio, moving = 0.0, [member for member in members if not member.stands]
     if moving and all(member.wander.any() for member in moving):
-        floor = max(np.sqrt(drifts / dt), rare * of(*MOTION, default=base.velocity_floor, unit="m/s"))
+        floor = max(np.sqrt(drifts / dt), rare * of(base.velocity_floor, "m/s", *MOTION))
         summary.assume(
             f"{floor:.2g} m/s or more as the noise of velocities from fixes, where no velocity or heading was logged"
         )
@@ -285,7 +280,7 @@ def assumed(
         ratio, floor = base.velocity_std_ratio, base.velocity_floor
         summary.assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")
     else:
-        floor = rare * of(*MOTION, default=0.0, unit="m/s")
+        floor = rare * of(0.0, "m/s", *MOTION)
         if not body and {"speed", "heading"} <= set(square.index):
             heading = float(np.sqrt(square["heading"]))  # whose error, v^2 s_h^2 across, lasts until the next one
             across = (only(rows, "speed")["value"] ** 2).mean() * heading**2 * _apart(rows, ["heading"], dt)

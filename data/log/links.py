@@ -40,12 +40,12 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     """
     there = np.isfinite(stacked(members, "velocity")[..., 0])
     summary, sent = steps.summary, only(rows, "message")
-    measured = _measured(rows[in_group(rows, "relative")], rows, members, there, steps)
+    measured = _measured(rows, members, there, steps)
     if mutual:
         stands = np.array([member.stands for member in members.values()])
         far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
-        aimed = measured.loc[measured["component"] == 1, LINK_COLUMNS]
-        reached = pd.MultiIndex.from_frame(far[LINK_COLUMNS]).isin(pd.MultiIndex.from_frame(aimed))
+        aimed = measured[measured["component"] == 1]
+        reached = far.set_index(LINK_COLUMNS).index.isin(aimed.set_index(LINK_COLUMNS).index)
         if reached.any():
             summary.assume(RADAR, str(int(reached.sum())))
         back = far[~reached]
@@ -93,18 +93,22 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     rank = pd.DataFrame({"step": links.step[near], "observer": links.observer[near]}).groupby(["step", "observer"])
     near = near[rank.cumcount() < v2x.max_neighbours]
     kept = np.union1d(near, np.flatnonzero(marked))
-    fewer = Links(links.step[kept], links.observer[kept], links.neighbour[kept])
-    measured = {name: getattr(recording, name)[:, kept] for name in ("relative", "arrival")}
-    recording = replace(recording, links=fewer, v2x=v2x, **measured)
+    recording = replace(with_links(recording, kept), v2x=v2x)
     if logged:
         return recording
     if v2x.loss > 0 and recording.runs == 1:
-        runs = runs_in_memory(runs, 8 * recording.broadcasts.size + 4 * len(fewer))
+        runs = runs_in_memory(runs, 8 * recording.broadcasts.size + 4 * len(kept))
         recording = recording.of_runs(np.zeros(runs, dtype=np.int64))
-    broadcasts, arrival = schedule(recording.ids, recording.t, fewer, v2x, recording.runs, seed)
+    broadcasts, arrival = schedule(recording.ids, recording.t, recording.links, v2x, recording.runs, seed)
     broadcasts = broadcasts & recording.present
     broadcasts[..., marks] = False
     return replace(recording, broadcasts=broadcasts, arrival=np.where(marked[kept], -1, arrival))
+
+
+def with_links(recording: Recording, kept: Bools | Ints) -> Recording:
+    """The recording with some of its links, and what was measured and arrives over these."""
+    links = Links(*(each[kept] for each in (recording.links.step, recording.links.observer, recording.links.neighbour)))
+    return replace(recording, links=links, relative=recording.relative[:, kept], arrival=recording.arrival[:, kept])
 
 
 def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
@@ -123,9 +127,10 @@ def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:
     return pd.Index(list(ids)).get_indexer(pd.Index(names))
 
 
-def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:
+def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:
     """One of each step, observer, neighbour (columns of members) and component of a link, with its value: range m,
     azimuth (in body frames bearing) rad or inclination rad."""
+    std, rows = stated_std(rows, "x", "y"), rows[in_group(rows, "relative")]
     summary, body, value = steps.summary, steps.body, rows["value"].to_numpy(copy=True)
     observer, neighbour = (_columns(rows[who], members) for who in ("vehicle", "partner"))
     t, turned = rows["t"].to_numpy(), rows["kind"].eq("azimuth" if body else "bearing").to_numpy()
@@ -154,7 +159,6 @@ def _measured(rows: Rows, fixes: Rows, members: Mapping[str, Member], there: Boo
     summary.refuse(reason, table[again].sort_index())
     table = table[~again]
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
-    std = stated_std(fixes, "x", "y")
     moved, vague, full = _to_step(table, members, steps, NEAR_STDS * (std if std > 0.0 else Sensors().gnss_std[0]))
     summary.refuse("relative measurements between steps, of partners too near to move them to one", table[vague])
     summary.refuse("relative measurements at their maximum, of partners farther away", table[full])

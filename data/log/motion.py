@@ -254,10 +254,9 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
     summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2))
     wander = _wander(heading, moves, steps)
-    velocity = velocity + absent[:, None]
     climbs = 0.0 if flat or by_fixes or rows["kind"].isin(("vz", "vz_body")).any() else climbing(fixes)
-    rate, moves = rate + absent, moves + absent[:, None]
-    return Member(gnss, velocity, heading, text, False, rate, compass, moves, wander, climbs)
+    velocity, moves = velocity + absent[:, None], moves + absent[:, None]
+    return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
 
 
 def climbing(fixes: Signal) -> float:

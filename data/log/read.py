@@ -271,7 +271,7 @@ def _recording(
     wander = stacked(members, "wander")
     least = float(wander[:, [not member.stands for member in members.values()]].min(initial=wander.max()))
     uncertain = (wander - least).clip(0.0) if wander.max() > least and not sensors else np.empty(0)
-    sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()], least)
+    sensors = sensors or assumed(rows, steps, [*members.values()], least)
     return Recording(
         ids=ids,
         t=steps.grid,
@@ -467,8 +467,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
         for first, t, value in ((0, true.t, np.nan_to_num(true.value)), (3, heading.t, headings)):
             out = poses[:, column, first : first + 3]
             if len(t) > 1:
-                gap = longest_gap(t, recording.dt, max_gap)
-                out[:] = interpolate(t - steps[0], value, steps - steps[0], gap)
+                out[:] = interpolate(t - steps[0], value, steps - steps[0], longest_gap(t, recording.dt, max_gap))
                 if np.median(np.diff(t)) > SPARSE_SECONDS and len(t) > 2:
                     summary.assume(
                         f"a low-rate truth counts within {SPARSE_SECONDS:g} s of its samples, by Akima's interpolation"

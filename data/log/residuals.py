@@ -195,9 +195,8 @@ def filtered(log: Log) -> Check:
     expected[:, 1] += heading_variance[links.step, links.observer]
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
-    none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
-    stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
-    return Check(log, span + start, world, track, *stats, none, infinite, np.zeros(vehicles, dtype=np.int64))
+    stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting, np.zeros(vehicles)
+    return Check(log, span + start, world, track, *stats, np.full(vehicles, np.inf), np.zeros(vehicles, dtype=np.int64))
 
 
 def without(c: Check, columns: Sequence[int]) -> Check:
@@ -210,6 +209,11 @@ def without(c: Check, columns: Sequence[int]) -> Check:
 def plane(vectors: Floats) -> AnyArray:
     """East and north of vectors (..., 3) as x + iy."""
     return vectors[..., :2] @ [1, 1j]
+
+
+def in_space(plane: AnyArray) -> Floats:
+    """Vectors (..., 3) of x + iy, with the height 0, NaN where there is none."""
+    return np.stack([plane.real, plane.imag, 0.0 * plane.real], axis=-1)
 
 
 def distances(gap: Floats) -> list[Floats]:

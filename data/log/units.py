@@ -224,7 +224,7 @@ def fresh(rows: Rows, summary: "Summary") -> Rows:
     run = (~held).groupby(keys).cumsum()
     length = held.groupby([*keys, run.to_numpy()]).transform("size").where(~held).groupby(keys).transform("median")
     held &= (length >= 2) & (run.groupby(keys).transform("max") > 1)
-    lost = some.index[held.reindex(pd.MultiIndex.from_frame(some[[*keys, "t"]])).to_numpy(dtype=bool)]
+    lost = some.index[held.reindex(some.set_index([*keys, "t"]).index).to_numpy(dtype=bool)]
     summary.refuse("fixes and relative measurements that hold the values before", rows.loc[lost.sort_values()])
     return rows.drop(lost)
 
