@@ -14,7 +14,7 @@ from unseen_graphs import World, alignment_error, blocks, joined, lost, world, w
 import coopoc as co
 from coopoc.arrays import Bools, Ints
 from coopoc.formats.graph import Graph, PoseEdges
-from coopoc.optimize import Problem, Status, pose, solve_gnc
+from coopoc.optimize import Problem, Status, solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
 from coopoc.optimize.robust.graduated import mark
