@@ -133,12 +133,13 @@ def read_bag(
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all
         raise InputError(path.name, said(error), "must be a ROS bag", "Record it again, or reindex it.") from None
     if behind:
-        other = "received" if stamps == "header" else "header"
-        spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"
-        summary.assume(f"times are by stamps={stamps}; headers are {spread} (stamps={other} takes the other)")
+        summary.assume(
+            f"times are by stamps={stamps}; headers are between {min(behind):.3g} and {max(behind):.3g} s before they "
+            f"were received (stamps={'received' if stamps == 'header' else 'header'} takes the other)"
+        )
     if all(rows["true"].all() for rows in parts.values()):
-        types = ", ".join(name.rpartition("/")[2] for name in READ)
-        raise InputError(path.name, "0 messages", f"must hold {types}", "Check the topics with: ros2 bag info.")
+        allowed = f"must hold {', '.join(name.rpartition('/')[2] for name in READ)}"
+        raise InputError(path.name, "0 messages", allowed, "Check the topics with: ros2 bag info.")
     rows = pd.concat(parts).sort_values("row", kind="stable")
     by, turns = rows.index.get_level_values(0).map(what), rows["kind"] == "yaw_rate"
     gyros = rows["vehicle"][turns & (by == "imu")]

@@ -7,11 +7,10 @@ import tomllib
 import urllib.request
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from http.client import HTTPException
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote, urljoin
 
 from coopoc.errors import InputError, said, suggestion, unknown
@@ -23,11 +22,10 @@ ARCHIVE = "archive.zip"
 """Name under which an archive is shown while it is fetched."""
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A public data set.
 
-    Args:
+    Attributes:
         name: by which it is fetched.
         what: it holds, in a few words.
         licence: as its authors state it.

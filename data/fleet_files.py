@@ -123,7 +123,7 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
         raise InputError(path.name, error, "must be XML of sumo --fcd-output", "Write the file again.") from None
     frame = pd.DataFrame(rows, columns=[*FCD, "t"], index=range(1, len(rows) + 1))
     t, x, y, z, angle, incline, speed = (numeric(frame, name, path.name) for name in ("t", *FCD) if name != "id")
-    angle, incline = np.radians(angle), np.radians(incline)
+    angle, incline = np.radians([angle, incline])
     ahead = np.column_stack([np.sin(angle) * np.cos(incline), np.cos(angle) * np.cos(incline), np.sin(incline)])
     centre, velocity = np.column_stack([x, y, z]) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
     source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"

@@ -164,14 +164,12 @@ def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
     Raises:
         InputError: a folder without positions of landmarks.
     """
-    robots, marks = log.fleet.ids, surveyed(log)
-    t = log.fleet.t
+    t, marks = log.fleet.t, surveyed(log)
     wheel, turning = (between(Signal(t, each), t - calibration.lag) for each in (log.speed, log.turn_rate))
-    forward = _driven(calibration.speed, calibration.slip, wheel, turning)
     return planar_recording(
-        (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
+        (*log.fleet.ids, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
         t,
-        forward[..., None] * [1.0, 0.0],
+        _driven(calibration.speed, calibration.slip, wheel, turning)[..., None] * [1.0, 0.0],
         calibration.turn * turning,
         marks[:, 1:],
         log.relative,
@@ -294,8 +292,8 @@ def _measurements(folder: Path, numbers: list[int]) -> Floats:
         file = folder / f"Robot{robot}_Measurement.dat"
         table = _read(file, "time barcode range bearing")
         subject = subject_of.reindex(table[:, 1], fill_value=0.0).to_numpy()
-        hint = "Check Barcodes.dat, or remove the line."
-        _refuse(file, subject == robot, "must be another's: a robot does not measure itself", hint)
+        itself = "must be another's: a robot does not measure itself"
+        _refuse(file, subject == robot, itself, "Check Barcodes.dat, or remove the line.")
         _refuse(file, table[:, 2] <= 0, "must have a range > 0 m", "Remove the line.")
         parts.append(np.column_stack([table[:, 0], np.full(len(table), column), subject, table[:, 2:]]))
     rows = np.vstack(parts)

@@ -4,7 +4,7 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -84,8 +84,7 @@ def benchmark(
         return run_worlds(methods, out / "worlds", worlds, seed, validation, jobs)
     by_name = {task.name: task for task in (VALIDATION if validation else TASKS)}
     if seed is not None:
-        drawn = seed_of(seed)
-        by_name = {name: replace(task, seed=drawn) for name, task in by_name.items()}
+        by_name = {name: replace(task, seed=seed_of(seed)) for name, task in by_name.items()}
     every = (*by_name, *LOGGED, *roads(data), *CONVOYS)
     for name in tasks:
         if name not in every:
@@ -196,13 +195,12 @@ def card(name: str, drawn: Mapping[str, Task], data: Path | None = None, tasks: 
     return {**card_head(name), "tasks": [_row(task, run) for task, run in bar]}
 
 
-def page(cards: Iterable[Params]) -> str:
+def page(cards: Sequence[Params]) -> str:
     """Markdown tables of cards, of simulated tasks and of logs where there are any.
 
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
-    card_list = list(cards)
-    ordered = (sorted(rows, key=itemgetter(0)) for rows in (_simulated(card_list), _logs(card_list)) if rows)
+    ordered = (sorted(rows, key=itemgetter(0)) for rows in (_simulated(cards), _logs(cards)) if rows)
     return "\n\n".join(markdown([row for _, row in rows]) for rows in ordered)
 
 

@@ -101,8 +101,9 @@ def _findings(results: Results) -> list[str]:
             best = within.sort_values("rt_le_m", kind="stable").iloc[0]
             at = f", K = {best['max_neighbours']}, {best['schedule']}, {best[PAYLOAD]:.0f} B/s" if best[PAYLOAD] else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
-            name = f"{look(best['method']).label} ({best['noise_model']})"
-            texts.append(f"{words}: best is {name}{at}, {best['rt_le_m']:.3f} m.")
+            texts.append(
+                f"{words}: best is {look(best['method']).label} ({best['noise_model']}){at}, {best['rt_le_m']:.3f} m."
+            )
     return texts
 
 

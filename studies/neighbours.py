@@ -80,14 +80,14 @@ def _answer(results: Results) -> str:
     )
     if fed is None or joint is None or paper is None:
         return ""
-    better = "decide, where messages arrive" if joint < fed else "train"
     rate = mean(results, of("joint", "fitted", max_neighbours=k), "payload_bytes_per_second")
     card = weights.checkpoint("fedkalmannet", results.settings, 0).card
     once = sum(row["sent_bytes"] + row["received_bytes"] for row in card["history"]) / len(card["clients"])
     return (
-        f"Vehicles should collaborate while they {better}: with fitted covariances {k} neighbours give {joint:.2f} m "
-        f"for {rate:,.0f} B/s of messages, federated training alone {fed:.2f} m for {once / 1e6:.1f} MB, once; with "
-        f"the paper's identity covariances cooperation gives {paper:.2f} m for the same messages."
+        f"Vehicles should collaborate while they {'decide, where messages arrive' if joint < fed else 'train'}: with "
+        f"fitted covariances {k} neighbours give {joint:.2f} m for {rate:,.0f} B/s of messages, federated training "
+        f"alone {fed:.2f} m for {once / 1e6:.1f} MB, once; with the paper's identity covariances cooperation gives "
+        f"{paper:.2f} m for the same messages."
     )
 
 

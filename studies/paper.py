@@ -44,6 +44,6 @@ def paper(
         lead=[LEAD.format(where=chosen)],
         cards={name: in_words(card(name)) for name in bundled},
     )
-    took = (time.perf_counter() - began) / 60
-    print(f"coopoc: done in {took:.1f} min, {failed} failed cells. The report is {page}", file=sys.stderr)
+    took = f"{(time.perf_counter() - began) / 60:.1f} min"
+    print(f"coopoc: done in {took}, {failed} failed cells. The report is {page}", file=sys.stderr)
     return int(failed > 0)

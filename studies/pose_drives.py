@@ -3,10 +3,9 @@
 import hashlib
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,11 +36,10 @@ POSES: Mapping[str, Mapping[str, Any]] = {
 """Pose filters by name: their options."""
 
 
-@dataclass(frozen=True, eq=False)
-class Drive:
+class Drive(NamedTuple):
     """One run of real measurements in body frames.
 
-    Args:
+    Attributes:
         recording: with all its landmarks.
         begin: first poses (1, N, 4) m and rad, None where first fixes and compasses give them.
         truth: on the steps of the recording, None if there is none.
@@ -61,12 +59,11 @@ class Drive:
         return tuple(self.recording.ids[k] for k in self.recording.vehicles)
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
+class Source(NamedTuple):
     """Real measurements of a drive.
 
-    Args:
-        t: s of the part in which all vehicles are there.
+    Attributes:
+        seconds: length of the part in which all vehicles are there.
         vehicles: their number.
         landmarks: their number.
         posed: whether true poses are known, from which noise is learned.
@@ -76,7 +73,7 @@ class Source:
         text: what was measured, and where its noise comes from, for captions, with braces for a name and for the s.
     """
 
-    t: Floats
+    seconds: float
     vehicles: int
     landmarks: int
     posed: bool
@@ -84,11 +81,6 @@ class Source:
     drive: Callable[[float, V2X], Drive]
     check: Callable[[float], object]
     text: Callable[[], str]
-
-    @property
-    def seconds(self) -> float:
-        """Length of the part."""
-        return float(self.t[-1] - self.t[0])
 
 
 @lru_cache(maxsize=2)
@@ -122,8 +114,9 @@ def _mrclam(folder: Path) -> Source:
         return Drive(recording, pose_start(recording, gate=GATE_STDS), log.fleet, True)
 
     text = "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
-    counts, digests = (len(log.fleet.ids), len(surveyed(log))), {"log": hashed(folder)}
-    return Source(log.fleet.t, *counts, True, digests, lru_cache(maxsize=2)(drive), calibration, lambda: text)
+    seconds, made = float(np.ptp(log.fleet.t)), lru_cache(maxsize=2)(drive)
+    marks, digests = len(surveyed(log)), {"log": hashed(folder)}
+    return Source(seconds, len(log.fleet.ids), marks, True, digests, made, calibration, lambda: text)
 
 
 def _logged(log: Log, span: str) -> Source:
@@ -143,9 +136,10 @@ def _logged(log: Log, span: str) -> Source:
         return f"What {{}} holds ({read}),{where} {noise}"
 
     posed = truth is not None and truth.heading is not None
-    digests = {"log": digest(log.recording), "truth": "" if truth is None else truth.digest}
-    counts = len(log.recording.ids) - marks, marks
-    return Source(log.recording.t, *counts, posed, digests, lru_cache(maxsize=2)(drive), lambda until: begun(), text)
+    digests = {"log": digest(log.recording), "truth": truth.digest if truth else ""}
+    seconds, made = float(np.ptp(log.recording.t)), lru_cache(maxsize=2)(drive)
+    vehicles = len(log.recording.vehicles)
+    return Source(seconds, vehicles, marks, posed, digests, made, lambda until: begun(), text)
 
 
 def near(k: int, loss: float = 0.0) -> V2X:
@@ -203,8 +197,7 @@ def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
     """
     marks = np.array(recording.landmarks, dtype=np.int64)
     landmarks = min(landmarks, len(marks))
-    every = len(marks) / max(landmarks, 1)
-    chosen = marks[(every * np.arange(landmarks)).astype(np.int64)]
+    chosen = marks[(len(marks) / max(landmarks, 1) * np.arange(landmarks)).astype(np.int64)]
     links = recording.links
     gone = np.isin(links.neighbour, marks) & ~np.isin(links.neighbour, chosen) & (links.step >= start)
     return with_links(recording, ~gone)

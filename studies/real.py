@@ -222,12 +222,9 @@ def _sent(results: Results, where: Where) -> int | None:
 def _gains(results: Results) -> Table | None:
     """Paired differences of RT-LE from the filter with the same K and the noise as assumed."""
     rows = [row for row in _rows(results) if row[1]["method"] != BASE["method"]]
-
-    def gap(results: Results, where: Where) -> Any:
-        return difference(results, where, {**where, **BASE})
-
     text = f"RT-LE [m] less that of {look(BASE['method']).label} with the same K, paired."
-    return crossed(results, HEAD, rows, across(gap, _columns(results)), _caption(results, text), decimals=3)
+    gaps = across(lambda rows, where: difference(rows, where, {**where, **BASE}), _columns(results))
+    return crossed(results, HEAD, rows, gaps, _caption(results, text), decimals=3)
 
 
 def _trade(results: Results) -> "Plot | None":

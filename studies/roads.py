@@ -64,8 +64,9 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
         truth = Fleet(("car",), 0.1037 * np.arange(len(motion)), ways[1], motion, name="KITTI 00")
         drawn = observe(truth, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)
-        notes = (f"odometry: {NOTHING_SIMULATED}",)
-        recording = replace(drawn, velocity=measured[None], sensors=Sensors(), notes=notes)
+        recording = replace(
+            drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {NOTHING_SIMULATED}",)
+        )
     else:
         options = {"truth": files[1]} if files[1:] else {"dt": COMMA_STEP} if files and task in ROADS else {}
         log = read_log(files[0] if files else str(data), **options)
@@ -165,8 +166,7 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     driven = np.repeat(motion[route, None], len(starts), axis=1)
     ids, t = tuple(f"v{k}" for k in range(len(starts))), recording.t[:length] - recording.t[0]
     fleet = Fleet(ids, t, in_space(true), in_space(driven) / dt, name=task)
-    v2x = V2X(max_neighbours=neighbours, radius=150.0)
-    drawn = observe(fleet, recording.sensors, v2x, runs=RUNS, seed=SEED)
+    drawn = observe(fleet, recording.sensors, V2X(max_neighbours=neighbours, radius=150.0), runs=RUNS, seed=SEED)
     gnss, velocity = (
         np.tile(each, (RUNS, 1, 1, 1)) for each in (in_space(true + error[rows]), in_space(ratio[rows] * driven) / dt)
     )
@@ -181,8 +181,7 @@ def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
     count = int(np.clip((len(recording.t) - fixes[0]) * recording.dt / SHORTEST_PIECE, 1, PIECES))
     wanted = np.linspace(fixes[0], len(recording.t), count + 1)[:-1]
     starts = [int(fixes[np.searchsorted(fixes, np.ceil(first))]) for first in wanted]
-    ends = [*starts[1:], len(recording.t)]
-    return starts, min(end - start for start, end in zip(starts, ends, strict=True))
+    return starts, int(np.diff([*starts, len(recording.t)]).min())
 
 
 def convoy_row(task: str, data: Path | None, method: Method) -> Row:

@@ -108,8 +108,7 @@ def _there(data: str) -> Bools:
     log = _log(data)
     if log is None:
         return fleet(data).present
-    started = np.isfinite(log.recording.gnss[0, :, :, 0])
-    there: Bools = log.recording.present & np.maximum.accumulate(started, axis=0)
+    there: Bools = log.recording.present & np.maximum.accumulate(np.isfinite(log.recording.gnss[0, :, :, 0]), axis=0)
     standing = (np.nan_to_num(log.recording.velocity[0]) == 0).all(axis=(0, 2))
     if not standing.all():
         there &= ~standing  # a road-side unit knows where it is
@@ -185,11 +184,10 @@ def conditions(p: Params) -> str:
     """Heading and size of a cell, for captions; of real data whose they are."""
     real = measured(p["data"])
     labels = f" ({real.notes[0]})" if real is not None and real.notes else ""
-    who = egos(p)
     log = _log(p["data"])
     runs = log.recording.runs if log is not None and (log.messages or not channel(p).loss) else p["runs"]
     name, there = Path(split(p["data"])[0]).name, _there(p["data"]).any(axis=0).sum()
-    size = f"{counted(runs, 'run')}, {counted(len(who), 'ego')} of {name} ({counted(there, 'vehicle')})"
+    size = f"{counted(runs, 'run')}, {counted(len(egos(p)), 'ego')} of {name} ({counted(there, 'vehicle')})"
     trained = f", {counted(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."
 

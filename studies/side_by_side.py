@@ -31,6 +31,8 @@ CONDITIONS = {
 """Other conditions: the channel (None: its own), outliers (as `Outliers.named` has them), spoofing, time-correlated
 errors, errors of the heading, the start."""
 
+PLAIN = {"best": None, "intervals": False}
+"""Options of a table of what is not ranked."""
 HELD = "GNSS repeats a fix until the next one, and errs by the way driven since."
 
 
@@ -100,15 +102,13 @@ STUDY = lineup.study(
     shares=("max_neighbours",),
     tables={
         "rt_le": _table("RT-LE [m] against K.", "rt_le_m"),
-        "nees": _table("NEES against K (3 is consistent; 2 in the plane).", "nees", best=None, intervals=False),
-        "in_band": _table(
-            "Share of steps whose run-averaged NEES is in its 99 % band.", "nees_inside", best=None, intervals=False
-        ),
+        "nees": _table("NEES against K (3 is consistent; 2 in the plane).", "nees", **PLAIN),
+        "in_band": _table("Share of steps whose run-averaged NEES is in its 99 % band.", "nees_inside", **PLAIN),
         "innovation": _table(
             "RMS innovation of the fixes [m] against K: how well a method predicts the next fix.", "innovation_m"
         ),
-        "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False),
-        "bytes": _table("Received per ego [B/s].", "bytes_per_second", best=None, intervals=False, decimals=0),
+        "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", **PLAIN),
+        "bytes": _table("Received per ego [B/s].", "bytes_per_second", **PLAIN, decimals=0),
     },
     figures={"rt_le": _figure},
     findings=_findings,

@@ -160,7 +160,7 @@ def located(folder: Path | None, name: str) -> Path:
     """
     entry = public().get(holder(name))
     folders = [] if folder is None else [folder]
-    folders += [cache_folder() / entry.name] if entry and entry.fetched else []
+    folders += [entry.folder] if entry and entry.fetched else []
     paths = [path for one in folders if one.is_dir() for path in (one, *sorted(one.rglob(name))) if path.name == name]
     if not paths:
         searched = str(folder or cache_folder())

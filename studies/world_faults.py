@@ -1,9 +1,9 @@
 """What may be wrong in a world: kinds of fault, each of which makes another scene of a scene."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,8 +19,7 @@ Edit: TypeAlias = Callable[[Recording], Recording]
 Draws: TypeAlias = np.random.Generator
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(NamedTuple):
     """A world before its recording: each kind of fault returns another scene, and words for it.
 
     Attributes:
@@ -43,12 +42,12 @@ class Scene:
 
     def edited(self, edit: Edit) -> "Scene":
         """The same with one more edit."""
-        return replace(self, edits=(*self.edits, edit))
+        return self._replace(edits=(*self.edits, edit))
 
     def sensing(self, stated: bool = False, **more: Any) -> "Scene":
         """The same with other sensors, whose noise methods assume, if `stated`."""
         assumed = replace(self.assumed, **more) if stated else self.assumed
-        return replace(self, acting=replace(self.acting, **more), assumed=assumed)
+        return self._replace(acting=replace(self.acting, **more), assumed=assumed)
 
     def outliers(self, **more: Fault) -> "Scene":
         """The same with more outliers."""
@@ -191,14 +190,14 @@ def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Made:
 
 def _late(scene: Scene, rng: Draws) -> Made:
     latency = rng.uniform(0.05, 0.8)
-    return replace(scene, v2x=replace(scene.v2x, latency=latency)), f"{latency:.2f} s"
+    return scene._replace(v2x=replace(scene.v2x, latency=latency)), f"{latency:.2f} s"
 
 
 def _lost(scene: Scene, rng: Draws) -> Made:
     loss, burst = rng.uniform(0.1, 0.7), log_uniform(rng, 1.0, 20.0)
     rate = min(float(rng.choice((1.0, 2.0, 5.0, 10.0, 20.0))), 1.0 / scene.fleet.dt)
     v2x = replace(scene.v2x, loss=loss, burst=burst, rate=rate)
-    return replace(scene, v2x=v2x), f"{100 * loss:.0f} %, {burst:.0f} at once, at {rate:g} Hz"
+    return scene._replace(v2x=v2x), f"{100 * loss:.0f} %, {burst:.0f} at once, at {rate:g} Hz"
 
 
 def _clocks(scene: Scene, rng: Draws) -> Made:
@@ -257,7 +256,7 @@ def _sybil(scene: Scene, rng: Draws) -> Made:
         velocity=np.append(fleet.velocity, fleet.velocity[:, [liar] * count], axis=1),
     )
     moved = (fleet.t >= start)[:, None, None] * offset[:, None, None]
-    made = replace(scene, fleet=who).edited(partial(_shifted, columns=columns, offset=moved))
+    made = scene._replace(fleet=who).edited(partial(_shifted, columns=columns, offset=moved))
     return made, f"one as {count + 1}, from {start:.0f} s on"
 
 
@@ -270,8 +269,8 @@ def _come_and_go(scene: Scene, rng: Draws) -> Made:
         away = (t < start) | (t >= stop) if rng.uniform() < 0.5 else (t >= start) & (t < stop)
         away[-1] &= not away.all()
         position[away, column] = velocity[away, column] = np.nan
-    fleet = replace(scene.fleet, position=position, velocity=velocity)
-    return replace(scene, fleet=fleet), f"{len(who)} of {len(scene.others)}"
+    scene = scene._replace(fleet=replace(scene.fleet, position=position, velocity=velocity))
+    return scene, f"{len(who)} of {len(scene.others)}"
 
 
 CREEP = (5.0, 30.0)

@@ -2,9 +2,9 @@
 
 import zlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ COUNTS = (0.2, 0.3, 0.3, 0.2)
 """Probability of zero to three kinds of fault."""
 
 
-@dataclass(frozen=True, eq=False)
-class World:
+class World(NamedTuple):
     """A draw of all that a method may meet in a drive of 40 to 60 s.
 
     Attributes:
@@ -138,8 +137,7 @@ def _text(scene: Scene) -> str:
 
 
 def _town(rng: Draws, t: Floats, split: Split) -> Floats:
-    name = str(rng.choice(("town10", "town04"))) if split == "test" else "town10-validation"
-    town = _loaded(name)
+    town = _loaded(str(rng.choice(("town10", "town04"))) if split == "test" else "town10-validation")
     start = (rng.uniform(1.5, town.t[-1] - t[-1] - town.dt) + t) / town.dt
     step = start.astype(int)
     share = (start - step)[:, None, None]

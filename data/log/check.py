@@ -189,7 +189,8 @@ def _axes(c: Check, column: int) -> str:
             "both swapped, or is it in another frame?"
         )
     moved, driven, *_ = moves(c, column)
-    size = np.linalg.norm(moved) * np.linalg.norm(driven)
+    length = np.linalg.norm(moved)
+    size = length * np.linalg.norm(driven)
     u = rec.velocity[0, rec.present[:, column], column, :2]
     height = pd.Series(rec.gnss[0, :, column, 2]).dropna()
     climbed = pd.Series(rec.velocity[0, :, column, 2] * rec.dt).cumsum()[height.index]
@@ -199,9 +200,7 @@ def _axes(c: Check, column: int) -> str:
         return ""
     both = np.stack([driven, driven.conj()], axis=1)  # swapped degrees have other lengths; one axis, both
     (turn, mirror), *_ = np.linalg.lstsq(both, moved)
-    if abs(mirror) > 2 * abs(turn) and np.linalg.norm(both @ [turn, mirror]) > LEAST_CORRELATION * np.linalg.norm(
-        moved
-    ):
+    if abs(mirror) > 2 * abs(turn) and np.linalg.norm(both @ [turn, mirror]) > LEAST_CORRELATION * length:
         return (
             f"axes look swapped or mirrored: fixes move as odometry mirrored at {np.angle(mirror, deg=True) / 2:.0f}"
             " deg from +x. At 45, swap easting and northing, latitude and longitude, or vx and vy; headings clockwise "
@@ -236,10 +235,8 @@ def _of_rows(c: Check) -> Iterator[str]:
     """Measurements and columns that were left out."""
     summary = c.log.summary
     left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith(EXPECTED)}
-    used = [number for why, number in left.items() if any(word in why for word in USED_COUNTS)]
-    share = max(
-        sum(used) / max(sum(used) + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or np.inf)
-    )
+    used = sum(number for why, number in left.items() if any(word in why for word in USED_COUNTS))
+    share = max(used / max(used + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or np.inf))
     held = left.get(HOLDS, 0) > LEAST_FIXES
     if share > UNUSED_SHARE or held:
         why = HOLDS if held else max(left, key=lambda reason: left[reason])
@@ -330,11 +327,11 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         )
         return sentences
     elif _beyond(row, "speed_excess", LEAST_SCALE):
-        word = "fast" if row["speed_excess"] > 0 else "slow"
         sentences.append(
-            f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
-            f"{100 * row['speed_excess_error']:.2f} %: scale={name}.speed:{1 / (1 + row['speed_excess']):.4g} mends it "
-            "(or of .vx and .vy), and a pose filter estimates it."
+            f"{name}: its odometry is too {'fast' if row['speed_excess'] > 0 else 'slow'} by "
+            f"{100 * abs(row['speed_excess']):.2f} +- {100 * row['speed_excess_error']:.2f} %: "
+            f"scale={name}.speed:{1 / (1 + row['speed_excess']):.4g} mends it (or of .vx and .vy), and a pose filter "
+            "estimates it."
         )
     if _beyond(row, "yaw_rate_bias", LEAST_DRIFT):
         sentences.append(
@@ -419,9 +416,8 @@ def _of_fixes(c: Check) -> Iterator[str]:
                 break
         wrong = _beyond(row, "nis", OUTLYING) or row.get("per_std", 0.0) > OUTLYING
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
-            way = "behind" if lag > 0 else "ahead of"
             yield (
-                f"{name}: its fixes are {abs(lag):.0f} s {way} the {what}, which "
+                f"{name}: its fixes are {abs(lag):.0f} s {'behind' if lag > 0 else 'ahead of'} the {what}, which "
                 f"they else follow: clocks differ, as by leap seconds (clock={name}:{lag:.0f} where all its stamps "
                 "are so), or files of two drives."
             )
@@ -429,10 +425,10 @@ def _of_fixes(c: Check) -> Iterator[str]:
         if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND) or truth is None or arm:
             continue  # an arm, which draws aside, draws along a bend, too
         if sure[2] and abs(lag := factor[2]) >= LEAST_LAG:
-            way = "ahead of" if lag > 0 else "behind"
             yield (
-                f"{name}: its fixes are {abs(lag):.2f} s {way} the truth along its way: clocks differ, or fixes carry "
-                "the time at which they arrived; at one speed an antenna ahead looks alike."
+                f"{name}: its fixes are {abs(lag):.2f} s {'ahead of' if lag > 0 else 'behind'} the truth along its "
+                "way: clocks differ, or fixes carry the time at which they arrived; at one speed an antenna ahead "
+                "looks alike."
             )
             continue
         every = rec.gnss[0, :, column] - truth.position[:, column]

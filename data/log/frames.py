@@ -69,10 +69,9 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
             early = {name: rows[name].mask(part < 0.5, rows[name] + period) for name in ("t", "arrival")}
             return rows.assign(**early)
     if 0 < back.mean() < DISORDER_SHARE:
-        who = ", ".join(rows["vehicle"][back].unique())
         summary.assume(
-            f"stamps of {who} go back (first: {row_of(rows[back])}): was a clock set? If the logger restarted, "
-            "give each part a log of its own. Rows are sorted by time"
+            f"stamps of {', '.join(rows['vehicle'][back].unique())} go back (first: {row_of(rows[back])}): was a clock "
+            "set? If the logger restarted, give each part a log of its own. Rows are sorted by time"
         )
     return rows
 

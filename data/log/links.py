@@ -114,12 +114,13 @@ def with_links(recording: Recording, kept: Bools | Ints) -> Recording:
 def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
     """Rows in which vehicles measure: a range that a landmark measured is one to it; whatever else it measured or sent
     says nothing without its heading."""
-    own, theirs = (rows[who].isin(landmarks) for who in ("vehicle", "partner"))
+    vehicle, partner = rows["vehicle"], rows["partner"]
+    own, theirs = vehicle.isin(landmarks), partner.isin(landmarks)
     turned = own & ~theirs & (rows["kind"] == "range")
     left = own & ~turned & in_group(rows, "relative", "message")
     summary.refuse("messages of landmarks, and their measurements other than ranges to vehicles", rows[left])
-    swapped = {"vehicle": rows["partner"], "partner": rows["vehicle"]}
-    return rows.assign(**{who: rows[who].where(~turned, other) for who, other in swapped.items()})[~left]
+    rows = rows.assign(vehicle=vehicle.mask(turned, partner), partner=partner.mask(turned, vehicle))
+    return rows[~left]
 
 
 def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:

@@ -1,7 +1,6 @@
 """Resampling of one member of a log to steps: fixes, velocity or speed and yaw rate, heading, presence."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,11 +102,10 @@ class Steps(NamedTuple):
         return step, t - self.grid[step]
 
 
-@dataclass(frozen=True, eq=False)
-class Member:
+class Member(NamedTuple):
     """A member of a log on T steps.
 
-    Args:
+    Attributes:
         gnss: (T, 3) m, NaN without a fix.
         velocity: (T, 3) m/s, mean over the step that ends at each instant, in body frames forward; NaN where absent.
         heading: measured or derived; what wanders is the variance of a velocity or direction that fixes have shown.

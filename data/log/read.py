@@ -94,7 +94,7 @@ class Log:
         Raises:
             InputError: a part of fewer than two steps.
         """
-        truth = None if self.truth is None else parted(self.truth, since, until)
+        truth = self.truth and parted(self.truth, since, until)
         return replace(self, recording=parted(self.recording, since, until), truth=truth)
 
 
@@ -415,13 +415,16 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     if dt is None:
         dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST_STEP):.3g}")
         if dense < step:
-            interpolated = f"odometry every {step:g} s is interpolated, which looks as far ahead"
-            summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {interpolated}")
+            summary.assume(
+                f"steps of {dense:g} s, as fixes or pairs are measured; odometry every {step:g} s is interpolated, "
+                "which looks as far ahead"
+            )
             step = dense
         seldom = float(f"{min(pairs, fixes, LONGEST_STEP):.3g}")  # unknown where there are no pairs
         if not body and pairs > step and seldom > step:
-            often = f"odometry every {step:g} s is averaged"
-            summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; {often}")
+            summary.assume(
+                f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged"
+            )
             step = seldom
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 

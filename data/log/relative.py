@@ -162,7 +162,6 @@ def of_measurements(c: Check) -> Iterator[str]:
             continue
         word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
         hint = HINTS[name]
-        stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = max(should**2 - least**2, 0.0) ** 0.5
         wrong = std > WIDE_RATIO * max(should, noise) or (name == "azimuth" and std > MAX_ANGLE_STD > 3 * position)
         scaled = False
@@ -197,6 +196,7 @@ def of_measurements(c: Check) -> Iterator[str]:
             )
         of_pairs = misfits and (not wrong or hint == HINTS[name])
         if wrong and not of_pairs:
+            stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
             yield f"{word}s miss the positions by {stated}. {hint}"
         if of_pairs:
             count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))

@@ -179,7 +179,7 @@ def _leaps(ranges: Rows, number: float) -> Bools:
 
 def check_values(rows: Rows) -> None:
     """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
-    kind, value, partner = (rows[name] for name in ("kind", "value", "partner"))
+    kind, value, partner = rows["kind"], rows["value"], rows["partner"]
     limit = kind.map(KIND_LIMITS)
     alone = in_group(rows, "relative") & (partner == "")
     deviation = "standard deviation of {kind}"
