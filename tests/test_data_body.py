@@ -260,7 +260,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     two = replace(results, frame=results.select(method="pose-fleet", landmarks=1, max_neighbours=[0, 1]))
     assert "over 2 cells" in real.STUDY.answers(two)[-1]
     assert not real.STUDY.answers(replace(results, frame=results.select(method="pose-naive")))
-    unposed = replace(real.drives.source(data), posed=False)
+    unposed = real.drives.source(data)._replace(posed=False)
     monkeypatch.setattr(real.drives, "source", lambda _: unposed)
     assert "No row is trained" in real._caption(results, "")
 
