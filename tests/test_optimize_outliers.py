@@ -14,7 +14,7 @@ from unseen_graphs import World, alignment_error, blocks, joined, lost, world, w
 import coopoc as co
 from coopoc.arrays import Bools, Ints
 from coopoc.formats.graph import Graph, PoseEdges
-from coopoc.optimize import Problem, Status, solve_gnc
+from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
 from coopoc.optimize.robust.graduated import mark
@@ -150,3 +150,11 @@ def test_wrong_loops_that_agree_with_each_other_are_reported():
     assert "rejects 12 of 40" in solution.notes[0]
     problem = from_graph(lost(turned(20)), start="odometry")
     assert solve_gnc(problem, loop_closures(problem)).notes[0].startswith("DOUBTFUL: GNC rejects 20 of 40")
+
+
+def test_one_measurement_decides_with_a_note():
+    problem = Problem(("A0", "B0"), x0=pose(np.zeros((2, 2))), dimension=2, poses=(0, 1), fixed=(0,))
+    seen = "relative_pose", ("A0", "B0"), pose([1.0, 0.0])
+    problem = problem.add(*seen, std=[0.1, 0.1, 0.1])
+    assert solve_gnc(problem, [0]).notes == ("B0 is joined to the others by one candidate alone: nothing confirms it",)
+    assert solve_gnc(problem.add(*seen, std=[0.2, 0.2, 0.2]), [0, 1]).notes == ()

@@ -18,7 +18,7 @@ from ..solution import Solution, SolveError, Status
 from ..solve import solve
 from ..starts.initial import initial_guess
 from .graduated import LAST_MU, Candidates, Graduation, bounds, contest, graduate, mark
-from .loop_closures import known_start
+from .loop_closures import known_start, unconfirmed
 
 
 def solve_gnc(
@@ -116,7 +116,7 @@ def solve_gnc(
         iterations=sum(each) + final.iterations,
         solve_seconds=clock() - began - final.build_seconds - final.check_seconds,
         status=status,
-        notes=(*notes, *doubts, *final.notes),
+        notes=(*notes, *doubts, *unconfirmed(marked, end.weight), *final.notes),
         extras=final.extras | {"start": best, "weights": end.weight[marked.group]},
     )
     if throw and not end.settled:

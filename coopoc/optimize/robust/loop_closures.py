@@ -40,10 +40,7 @@ def known_start(marked: Marked, inner: Inner) -> tuple[Floats, Floats] | None:
     problem, bound = marked.problem, marked.bound
     weight, left = np.zeros(len(bound)), np.zeros(len(bound), dtype=np.int64)
     x = along_poses(marked.reweigh(weight, initial_guess(problem)))
-    measured = [factor.nodes[factor.informative] for factor in marked.reweigh(weight, x).factors]
-    part, alone = parts(len(problem.names), *measured), [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
-    held: Ints = np.concatenate([problem.fixed, *alone]).astype(np.int64)
-    if not np.isin(part, part[held]).all():
+    if len(_free(marked, weight)[1]):
         return None
     sparse(problem)  # is kept as long as the problem is, so that all rounds share its analysis
     most_joins = 1
@@ -64,6 +61,33 @@ def known_start(marked: Marked, inner: Inner) -> tuple[Floats, Floats] | None:
             if not any(_explained(marked, x, weight, group) for group in some.tolist()):
                 break
     return x, weight
+
+
+def _free(marked: Marked, weight: Floats) -> tuple[Ints, Ints]:
+    """(n,) parts that known inliers and candidates with a weight (G,) join, and the nodes that they join to no fixed
+    one and not to the world."""
+    problem = marked.problem
+    factors = marked.reweigh(weight, initial_guess(problem)).factors
+    measured = [factor.nodes[factor.informative] for factor in factors]
+    part, alone = parts(len(problem.names), *measured), [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
+    held: Ints = np.concatenate([problem.fixed, *alone]).astype(np.int64)
+    return part, np.flatnonzero(~np.isin(part, part[held]))
+
+
+def unconfirmed(marked: Marked, weight: Floats) -> list[str]:
+    """A note for each of the candidates with a weight (G,) without which nodes are free: no other agrees with it."""
+    part, free = _free(marked, 0.0 * weight)
+    if not len(free):
+        return []
+    pairs = zip(marked.factor, marked.row, strict=True)
+    ends = np.sort([part[marked.problem.factors[k].nodes[row, [0, -1]]] for k, row in pairs], axis=1)
+    kept = weight[marked.group] > 0.0
+    _, which, count = np.unique(ends[kept], axis=0, return_inverse=True, return_counts=True)
+    names = dict[str, None]()
+    for group in marked.group[kept][count[which.ravel()] == 1].tolist():
+        without = np.where(np.arange(len(weight)) == group, 0.0, weight)
+        names |= {marked.problem.names[k]: None for k in _free(marked, without)[1][:1]}
+    return [f"{name} is joined to the others by one candidate alone: nothing confirms it" for name in names]
 
 
 def _explained(marked: Marked, x: Floats, weight: Floats, group: int) -> bool:
