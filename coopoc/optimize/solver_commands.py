@@ -91,7 +91,7 @@ def without_outliers(problem: Problem, backend: str) -> Solution:
     if not candidates:
         allowed = "must hold relative poses beside each robot's odometry"
         raise InputError("outliers", repr(problem), allowed, "Leave out --outliers.")
-    solution = solve_gnc(problem, candidates, backend=backend, throw=False)
+    solution = solve_gnc(problem, candidates, backend=backend, throw=False, start="known")
     nodes = np.concatenate([problem.factors[k].nodes[rows] for k, rows in candidates])
     rejected = [[problem.names[i] for i in pair] for pair in nodes[solution.extras["weights"] < 0.5].tolist()]
     return replace(solution, extras=solution.extras | {"rejected": rejected})

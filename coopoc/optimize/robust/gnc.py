@@ -1,12 +1,12 @@
 """Graduated non-convexity (GNC): least squares whose weights find the outliers."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, instance
+from ...arrays import Floats, instance, one_of
 from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import INLIER_WEIGHT, expected, implausible, rejection
@@ -20,6 +20,8 @@ from ..starts.initial import initial_guess
 from .graduated import LAST_MU, Candidates, Graduation, bounds, contest, graduate, mark
 from .loop_closures import known_start, unconfirmed
 
+Start = Literal["any", "known"]
+
 
 def solve_gnc(
     problem: Problem,
@@ -28,6 +30,7 @@ def solve_gnc(
     groups: npt.ArrayLike | None = None,
     backend: str | Backend = "gauss-newton",
     throw: bool = True,
+    start: Start = "any",
     **options: Any,
 ) -> Solution:
     """A minimum of 1/2 sum |r_inlier|^2 + 1/2 sum_g rho(r_g^2), r_g^2 = sum over the group of |W (h(x) - z)|^2.
@@ -54,6 +57,8 @@ def solve_gnc(
             each on its own.
         backend: of `solve`, for the last problem, and with constraints for every round.
         throw: as in `solve`.
+        start: "known" lets nothing compete with known inliers that hold every node: that takes minutes for thousands of
+            poses whose noise is stated too small.
         options: of the backend.
 
     Returns:
@@ -62,7 +67,7 @@ def solve_gnc(
 
     Raises:
         InputError: candidates that do not exist, appear twice or have a loss, other groups than measurements, a
-            threshold outside (0, 1), and what `solve` refuses.
+            threshold outside (0, 1), an unknown start, and what `solve` refuses.
         SolveError: (if `throw`) as `solve`, or weights that did not settle.
 
     References:
@@ -76,6 +81,7 @@ def solve_gnc(
     'another minimum, elsewhere, costs as much'
     """
     problem = started(instance("problem", problem, Problem))
+    one_of("start", start, Start)
     marked = mark(problem, candidates, groups)
     marked = replace(marked, bound=bounds(marked, threshold))
     each, began, doubts = list[int](), clock(), tuple[str, ...]()
@@ -103,7 +109,7 @@ def solve_gnc(
 
     known = known_start(marked, inner)
     best, end = "known", finish(*known) if known else None
-    if end is None or not explained(end):
+    if end is None or (start == "any" and not explained(end)):
         best, x, graduation, doubts = contest(marked, inner, initial_guess(problem), lambda at: finish(at).x, cost)
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
