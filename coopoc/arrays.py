@@ -17,11 +17,7 @@ Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 AnyArray: TypeAlias = npt.NDArray[Any]
 
-DTYPE_KINDS = {
-    float: ("fiu", "number"),
-    int: ("iu", "whole number"),
-    bool: ("b", "boolean"),
-}
+DTYPE_KINDS = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
 """Allowed kinds of dtype -> the name of one entry."""
 TINY = 5e-324
 """The least positive number."""

@@ -122,11 +122,7 @@ def table(
     print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
 
 
-def report(
-    folders: Folders,
-    /,
-    out: Annotated[Path | None, arg(metavar="FILE")] = None,
-) -> None:
+def report(folders: Folders, /, out: Annotated[Path | None, arg(metavar="FILE")] = None) -> None:
     """Write a self-contained HTML page on one or several studies.
 
     Example: coopoc report runs/neighbours runs/error_cdf --out report.html
@@ -152,12 +148,7 @@ def list_names() -> None:
             )
 
 
-OWN_COMMANDS: Mapping[str, Command] = {
-    "run": run,
-    "table": table,
-    "report": report,
-    "list": list_names,
-}
+OWN_COMMANDS: Mapping[str, Command] = {"run": run, "table": table, "report": report, "list": list_names}
 
 
 def _status(argv: list[str]) -> int:

@@ -128,10 +128,13 @@ READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
         ("scale", "std", "offset"),
         (partial(pairs, value=float), "name:number pairs, each name once", "range:0.001,t:1e-3"),
     ),
-    "antenna": (
-        lambda text: pairs(text, _place) if ":" in text else _place(text),
-        "metres forward/left/up, or vehicle:forward/left/up pairs",
-        "car1:1.2/0.3/0",
+    **dict.fromkeys(
+        ("antenna", "tag"),
+        (
+            lambda text: pairs(text, _place) if ":" in text else _place(text),
+            "metres forward/left/up, or vehicle:forward/left/up pairs",
+            "car1:1.2/0.3/0",
+        ),
     ),
     "clock": (partial(pairs, value=float), "vehicle:seconds pairs, each vehicle once", "blue:0.35"),
     "ignore": (lambda text: tuple(map(str.strip, text.split(","))), "words between commas", "imu,lidar"),

@@ -102,12 +102,7 @@ STUDY = lineup.study(
     "What does another neighbour bring online, at what cost, and can collaborative training replace it?",
     grid=_grid(),
     where=_meaningful,
-    settings={
-        **scene.TOWN,
-        **scene.WEIGHTS,
-        "runs": 30,
-        "train_seeds": 5,
-    },
+    settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 5},
     shares=("max_neighbours",),
     tables={f"rt_le_{model}": _table(model) for model in ("identity", "fitted", "nominal")},
     figures={"rt_le": _sides},

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.random import default_rng
 
 from coopoc import V2X, Fleet, Recording, Sensors, observe
 
@@ -28,7 +29,7 @@ NOISE = Sensors(gnss_std=(1.5, 1.5, 0.5), velocity_std_ratio=0.0, velocity_floor
 def observed(fleet: Fleet, k: int = 3, **channel: Any) -> Recording:
     """One run of noisy measurements, with noise on the velocity as wide as its floor."""
     recording = observe(fleet, NOISE, V2X(k, 120.0, **channel), seed=3)
-    noise = np.random.default_rng(0).normal(0, 0.1, recording.velocity.shape) * [1, 1, 0]
+    noise = default_rng(0).normal(0, 0.1, recording.velocity.shape) * [1, 1, 0]
     return replace(recording, velocity=recording.velocity + noise)
 
 
@@ -76,7 +77,7 @@ def at(fleet: Fleet, name: str, t: Any) -> Any:
 def fixes(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
     """Fixes x, y, z of one vehicle, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
-    x = at(fleet, name, t) + np.random.default_rng(seed).normal(0, std, (len(t), 3))
+    x = at(fleet, name, t) + default_rng(seed).normal(0, std, (len(t), 3))
     return pd.DataFrame({"t": t, "vehicle": name, **dict(zip("xyz", x.T, strict=True)), "x_std": std, "y_std": std})
 
 
@@ -84,7 +85,7 @@ def motion(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> 
     """World velocities vx, vy, vz of one vehicle, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     u = (at(fleet, name, t + 0.05) - at(fleet, name, t - 0.05)) / 0.1
-    u += np.random.default_rng(seed).normal(0, std, u.shape)
+    u += default_rng(seed).normal(0, std, u.shape)
     return pd.DataFrame({"t": t, "vehicle": name, "vx_std": std, **dict(zip(("vx", "vy", "vz"), u.T, strict=True))})
 
 
@@ -92,7 +93,7 @@ def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: 
     """Ranges of one vehicle to another, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     gap = np.linalg.norm(at(fleet, other, t) - at(fleet, name, t), axis=1)
-    return noisy(np.random.default_rng(seed), t, name, {"range": (gap, std)}).assign(partner=other)
+    return noisy(default_rng(seed), t, name, {"range": (gap, std)}).assign(partner=other)
 
 
 def noisy(rng: np.random.Generator, t: Any, name: str, columns: dict[str, tuple[Any, float]]) -> pd.DataFrame:
@@ -122,5 +123,5 @@ def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
 
 def outliers(values: Any, share: float = 0.05) -> Any:
     """Ranges of which a share is 3 to 10 m too long, as by reflections."""
-    rng = np.random.default_rng(9)
+    rng = default_rng(9)
     return values + np.where(rng.random(len(values)) < share, rng.uniform(3, 10, len(values)), 0.0)

@@ -23,15 +23,15 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         seed: of paths and noise.
         seconds: of the drive.
         rate: factor of all rates.
-        fault: `pairs` (a, b) -> m, `clocks` s and `wheels` (share of the speed) of vehicles, `late` fixes s, `unit` of
-            ranges, `tunnel` (from, to) s without fixes, `body` where drones log velocities in theirs.
+        fault: `pairs` (a, b) -> m, `clocks` s, `wheels` (share of the speed) and `tags` m of vehicles, `late` fixes s,
+            `unit` of ranges, `tunnel` (from, to) s without fixes, `body` where drones log velocities in theirs.
     """
     count, pace, apart, climb, fix, reach, rates = KINDS[kind]
     rng, noise, t = np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.02 * np.arange(int(seconds * 50))
     drones, cars, robots = (kind == name for name in KINDS)
     names, axes = [f"{kind}{k}" for k in range(count)], list("xyz" if drones else "xy")
     (begin, end), body = fault.get("tunnel", (-1, -1)), "body" in fault
-    place, speed, course, tables = {}, {}, {}, []
+    place, tip, speed, course, tables = {}, {}, {}, {}, []
     shape = rng.uniform(0.6, 1.4, (count, 3))
     for k, name in enumerate(names):
         s, (a, b, c) = t - k * apart / pace * cars, shape[0 if cars else k]
@@ -40,7 +40,10 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         path = np.cumsum(0.02 * speed[name] * np.exp(1j * course[name]))
         path += -k * apart if cars else apart * np.exp(1.9j * k) * (k > 0)
         place[name] = np.c_[path.real, path.imag, climb * np.sin(0.1 * t + k)]
-    place |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
+        ahead, left, up = fault.get("tags", {}).get(name, (0, 0, 0))
+        aside = np.exp(1j * course[name]) * (ahead + 1j * left)
+        tip[name] = place[name] + np.c_[aside.real, aside.imag, 0 * t + up]
+    tip |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
 
     def at(values, times):
         return np.column_stack([np.interp(times, t, axis) for axis in np.atleast_2d(values.T)])
@@ -71,8 +74,8 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
             add(name, moved, ["yaw_rate"], turn, 0.01)
         if cars:
             add(name, moved, ["heading"], at(course[name], moved), 0.01)
-        for other in names[k - 1 : k] if cars else [one for one in place if one != name]:
-            gap = at(place[other], ranged) - at(place[name], ranged)
+        for other in names[k - 1 : k] if cars else [one for one in tip if one != name]:
+            gap = at(tip[other], ranged) - at(tip[name], ranged)
             pairs, unit = fault.get("pairs", {}), fault.get("unit", 1.0)
             far = np.linalg.norm(gap, axis=1, keepdims=True) + pairs.get((name, other), pairs.get((other, name), 0.0))
             add(name, ranged, ["range"], far / unit, reach / unit, partner=other)

@@ -82,11 +82,19 @@ def test_position_methods_refuse_body_frames(body):
 
 
 def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body, tmp_path):
+    body = replace(body, tags=np.eye(8, 3))
     save_recording(body, tmp_path / "body.npz")
     again, _ = read_recording(tmp_path / "body.npz")
     assert np.array_equal(again.body.yaw_rate, body.body.yaw_rate)
+    assert np.array_equal(again.tags, body.tags)
     part = body.between(10, 20).of_runs(slice(1, 3))
     assert np.array_equal(part.body.heading, body.body.heading[1:3, 10:20])
+
+
+def test_who_has_no_heading_notes_tags(body):
+    world = in_world(replace(body, tags=np.eye(8, 3)))
+    assert "tags up to 1 m" in str(co.Kalman()(world).notes)
+    assert "tags" not in str(co.PoseFilter()(replace(body, tags=world.tags)).notes)
 
 
 def test_a_cap_acts_in_body_frames(crossing):

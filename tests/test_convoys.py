@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from conftest import measured, refused
+from numpy.linalg import norm
 
 import coopoc as co
 from coopoc.studies import benchmark, roads
@@ -22,7 +23,7 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task):
     assert count == (2 if task == "convoy-comma2k19" else 4)
     assert count * length <= len(drive.t)
     assert np.isfinite(recording.gnss[:, 0]).all()
-    start = np.linalg.norm(fleet.position[0] - fleet.position[0].mean(axis=0), axis=-1)
+    start = norm(fleet.position[0] - fleet.position[0].mean(axis=0), axis=-1)
     assert start.max() < 2 * roads.START_SPREAD
     error = (recording.gnss[0] - fleet.position)[..., :2]
     real = (drive.gnss[0, :, column] - truth.position[:, column])[:, :2]
@@ -33,11 +34,11 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task):
         assert known.sum() > 2
         assert error[known, k] == pytest.approx(piece[known], abs=1e-6)
         assert (np.isfinite(error[:, k, 0]) >= known).all()
-    speed, true = (np.linalg.norm(values, axis=-1) for values in (recording.velocity[0], fleet.velocity))
+    speed, true = (norm(values, axis=-1) for values in (recording.velocity[0], fleet.velocity))
     fast = true[:, 0] > 2.0
     assert fast.any()
     assert speed[fast, 0] == pytest.approx(
-        np.linalg.norm(drive.velocity[0, begins[0] :][:length, column], axis=-1)[fast], rel=0.02
+        norm(drive.velocity[0, begins[0] :][:length, column], axis=-1)[fast], rel=0.02
     )
     assert np.array_equal(recording.gnss[0], recording.gnss[1], equal_nan=True)
     assert not np.array_equal(recording.relative[0], recording.relative[1])

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from shell import ran
 from strange_logs import strange
@@ -248,7 +249,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     assert real.drives.calibrated(settings | {"calibrate_s": None}) == pytest.approx(0.4 * log.recording.t[-1])
     alone = co.PoseFilter("solo", lasting=True, gate=5.0)(log.recording, list(CARS))
     first = slice(100, 100 + int(real.drives.block(settings) / log.recording.dt))
-    apart = np.linalg.norm(alone.x[0, first, 1] - np.pad(drives()["blue"][0][first], ((0, 0), (0, 1))), axis=1)
+    apart = norm(alone.x[0, first, 1] - np.pad(drives()["blue"][0][first], ((0, 0), (0, 1))), axis=1)
     found = results.select(method="pose-fleet", max_neighbours=0, landmarks=1, ego="blue", run=0)["rt_le_m"]
     assert found.tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-9)
     error = results.select(method="pose-fleet").groupby("max_neighbours")["rt_le_m"].mean()
@@ -282,7 +283,7 @@ def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:
     for k, (now, (x, y)) in enumerate(zip(t, place, strict=True)):
         number = k % 4
         corner = np.array([-8.0 + 16 * (number % 2), -8.0 + 16 * (number // 2), 1.5 * (not wheels)])
-        reach = np.linalg.norm(corner - [x, y, 0.0])
+        reach = norm(corner - [x, y, 0.0])
         places = " ".join(map(str, corner[: 2 if wheels else 3]))
         measured.append(f"range{2 if wheels else 3} {now:.1f} {reach:.12g} 0.01 {places} {100 + number} 0")
         if wheels:  # 0.75 m/s and 0.15 rad/s, 0.2 m from wheel to wheel
@@ -310,7 +311,7 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path, wheels):
     assert (noise.range_std, noise.yaw_rate_std) == pytest.approx((0.1, np.sqrt(2e-4) / 0.2 if wheels else 0.01))
     begin = co.pose_start(log.recording)
     track = co.PoseFilter("solo", begin=begin)(log.recording, ["Hall"])
-    assert np.linalg.norm(track.x[0, 50:, 0, :2] - place[50:], axis=1).max() < 0.15
+    assert norm(track.x[0, 50:, 0, :2] - place[50:], axis=1).max() < 0.15
     assert np.abs(wrapped(track.heading[0, 50:, 0] - heading[50:])).max() < 0.05
     with refused("where ranges to anchors place it"):
         co.read_log(tmp_path / "hall")

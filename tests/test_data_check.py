@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from logs import bends, drive, fixes, motion, noisy, outliers, ranges, write
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
 
@@ -217,7 +218,7 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
 
 
 def test_fixes_of_what_stands_err_too(tmp_path):
-    x, y = np.random.default_rng(0).normal(0, 10, (2, 300))
+    x, y = default_rng(0).normal(0, 10, (2, 300))
     frame = pd.DataFrame({"t": np.arange(300), "x": x, "y": y, "vx": 0, "vy": 0})
     assert "NIS is" in said(read_log(write(frame, tmp_path / "a.csv")))
     assert "none of which changes" in str(check(read_log(write(frame.assign(x=0, y=0), tmp_path / "a.csv"))).unseen)
@@ -276,7 +277,7 @@ def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
 def turned_drive(folder: Path, speed: Any, turn: float, seconds: float = 120.0) -> Path:
     """A car that goes round in circles or stops, fixes of 1 m once a second, headings turned by an angle."""
     folder.mkdir(exist_ok=True)
-    rng, t = np.random.default_rng(1), np.arange(0, seconds, 0.04)
+    rng, t = default_rng(1), np.arange(0, seconds, 0.04)
     v = speed(t)
     heading = np.cumsum(0.01 * v * 0.04)
     x, y = np.cumsum(v * np.cos(heading)) * 0.04, np.cumsum(v * np.sin(heading)) * 0.04
@@ -327,7 +328,7 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
 )
 def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words):
     """Fixes a minute apart, and no truth; between two of them the heading is off."""
-    rng, t = np.random.default_rng(3), np.arange(0.0, 900.0)
+    rng, t = default_rng(3), np.arange(0.0, 900.0)
     heading, v = 2.5 * np.sin(0.03 * t), 4 + np.sin(0.02 * t)
     u = v * np.exp(1j * heading) + 0.3 * (fault == "current")
     x = np.cumsum(u) - 0.5 * u

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from conftest import refused
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 from test_data_generate import script
 
@@ -46,7 +47,7 @@ def test_town10_is_dense_and_urban():
     assert 5 <= stated["neighbours"]["mean"] <= 7
     assert stated["speed"]["max"] < 11.1
     assert stated["speed"]["standing"] < 0.3
-    path = np.linalg.norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0)
+    path = norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0)
     assert path.min() > 90, "every vehicle drives, m in 90 s"
 
 
@@ -55,7 +56,7 @@ def test_clients_have_the_papers_lengths_and_speeds():
     fleet = load_fleet("town10-clients")
     assert fleet.present.sum(axis=0).tolist() == [1550, 4600, 1450, 1420]
     assert (np.diff(fleet.present.astype(int), axis=0) <= 0).all(), "present from the start, absent after the end"
-    speed = np.linalg.norm(fleet.velocity, axis=2)
+    speed = norm(fleet.velocity, axis=2)
     ranges = np.c_[np.nanmin(speed, axis=0), np.nanmax(speed, axis=0)]
     np.testing.assert_allclose(ranges, [[8.9, 10.8], [9.2, 10.9], [0.7, 10.7], [3.6, 10.7]], atol=0.6)
     words = in_words(card("town10-clients"))
@@ -66,7 +67,7 @@ def test_town04_is_hilly():
     fleet = load_fleet("town04")
     assert np.ptp(fleet.position[..., 2]) > 10
     gap = fleet.position[:, None] - fleet.position[:, :, None]
-    distance = np.linalg.norm(gap, axis=-1)
+    distance = norm(gap, axis=-1)
     near = (distance < 30) & (distance > 0)
     elevation = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
     assert np.mean(elevation > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"

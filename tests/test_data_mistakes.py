@@ -79,6 +79,7 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "a truth of other vehicles": (GOOD, {"truth": "t,vehicle,x,y\n0,rot,0,0\n1,rot,8,0\n"}, "column vehicle"),
     "a clock of an unknown vehicle": (GOOD, {"clock": {"bleu": 0.1}}, ""),
     "an antenna of an unknown vehicle": (GOOD, {"antenna": {"bleu": (1, 0, 0)}}, ""),
+    "a tag of an unknown vehicle": (GOOD, {"tag": {"bleu": (1, 0, 0)}}, ""),
     "an antenna of what has no course": (STILL.replace("0.8", "0"), {"antenna": (1, 0, 0)}, "antenna of red"),
     "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
     "steps longer than the log": (GOOD, {"dt": 5.0}, "dt"),

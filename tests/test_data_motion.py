@@ -12,6 +12,8 @@ import pytest
 from conftest import refused
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
+from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -53,7 +55,7 @@ def log(
     folder: Path, name: str, std: float | Floats, every: int, seed: int = 0, steps: Sequence[int] = (), **more: Floats
 ) -> tuple[Log, Floats, Floats]:
     """A log of noisy fixes at some of the steps, and of what else is measured at all of them; times and fixes."""
-    x, rng = path(name), np.random.default_rng(seed)
+    x, rng = path(name), default_rng(seed)
     k = np.array(steps) if len(steps) else np.arange(0, len(T), every)
     z, std = np.full_like(x, np.nan), np.broadcast_to(std, x.shape)
     z[k] = x[k] + rng.normal(0, std[k])
@@ -87,7 +89,7 @@ def filtered(t: Floats, z: Floats, std: float, density: float) -> tuple[Floats, 
 
 
 def test_one_filter_of_the_bank_is_filterpys():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     t, w, std = np.cumsum(rng.uniform(0.2, 0.6, 60)), 0.4, 1.5
     z = np.c_[3 * t, 0.2 * t**2, 0 * t] + rng.normal(0, 0.1, (60, 3))  # no innovation is clipped
     interval = float(np.median(np.diff(t)))
@@ -136,7 +138,7 @@ def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_
 
 def test_a_body_velocity_that_errs_for_long_misleads_no_pose_filter(tmp_path):
     """By 3 % and 0.1 m/s on each axis; beside the filter that is told the errors, from when fixes have shown them."""
-    u, off, rng = np.gradient(path("drone"), 0.1, axis=0), list[float](), np.random.default_rng(5)
+    u, off, rng = np.gradient(path("drone"), 0.1, axis=0), list[float](), default_rng(5)
     heading = wrap(0.3 * T + rng.normal(0, 0.02, len(T)))
     turn = {"heading": heading, "heading_std": 0 * T + 0.02, "yaw_rate": 0 * T + 0.3}
     for name, bias in (("slow", 0.1), ("ideal", 0.0)):
@@ -145,7 +147,7 @@ def test_a_body_velocity_that_errs_for_long_misleads_no_pose_filter(tmp_path):
         rec = co.read_log(tmp_path / name, frame="body").recording
         told = rec.sensors if bias else replace(rec.sensors, speed_scale_std=0.0, velocity_bias_std=0.0)
         track = co.PoseFilter("solo", assumed=told)(rec)
-        off.append(np.linalg.norm(track.x[0, 600:, 0] - path("drone")[600:], axis=1).mean())
+        off.append(norm(track.x[0, 600:, 0] - path("drone")[600:], axis=1).mean())
         assert not bias or track.extras["vz_error"][0, -1] == pytest.approx(0.1, abs=0.02)
     assert off[0] < 1.3 * off[1]
 
@@ -153,11 +155,11 @@ def test_a_body_velocity_that_errs_for_long_misleads_no_pose_filter(tmp_path):
 def test_each_fix_counts_as_it_is_stated(tmp_path):
     """Of 2 cm but for half a minute."""
     poor = (T > 60) & (T < 90)
-    u = SPEED * np.exp(1j * COURSE) + np.random.default_rng(2).normal(0, 0.1, (len(T), 2)) @ [1, 1j]
+    u = SPEED * np.exp(1j * COURSE) + default_rng(2).normal(0, 0.1, (len(T), 2)) @ [1, 1j]
     std = np.where(poor, 3.0, 0.02)[:, None]
     read = log(tmp_path, "car", std, 2, vx=u.real, vy=u.imag, vz=0 * T, vx_std=0 * T + 0.1)[0]
     for method in (*FILTERS, co.BatchSmoother()):
-        off = np.linalg.norm(method(read.recording).x[0, :, 0] - path("car"), axis=1)
+        off = norm(method(read.recording).x[0, :, 0] - path("car"), axis=1)
         assert off[~poor].mean() < 0.06
         assert off[poor].mean() < 0.7
 
@@ -174,7 +176,7 @@ def test_a_vehicle_without_odometry_adds_no_noise_to_that_of_others(tmp_path):
 @pytest.mark.parametrize(("std", "bias"), [(1.5, 0.0), (1.5, 0.01), (15.0, 0.003)])
 def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, std, bias):
     """Beside the same log with a compass of 1 degree; without a gyro beside fixes alone."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     odometry = {"speed": 1.01 * SPEED + rng.normal(0, 0.1, len(T))}
     gyro = {"yaw_rate": RATE + bias + rng.normal(0, 0.01, len(T))}
     compass = {"heading": COURSE + rng.normal(0, np.radians(1.0), len(T))}
@@ -190,7 +192,7 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
 
 def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     """Beside a compass of 1 degree, on the way of a car; and what is known of no direction at the start is absent."""
-    rng, speed = np.random.default_rng(1), np.where(T > 0, SPEED, 0.0)
+    rng, speed = default_rng(1), np.where(T > 0, SPEED, 0.0)
     noise = {"speed_std": 0.1 + 0 * T, "yaw_rate_std": 0.001 + 0 * T}
     gyro = {"speed": speed, "yaw_rate": RATE + rng.normal(0, 0.001, len(T)), **noise}
     known = error(log(tmp_path / "known", "car", 1.0, 10, speed=speed, heading=COURSE)[0], co.Kalman())
@@ -200,13 +202,13 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     notes = co.Kalman()(log(tmp_path / "spun", "car", 1.0, 10, **spun)[0].recording).notes
     assert any(note.startswith("odometry, a: fails") for note in notes)
     coarse = co.read_log(tmp_path / "gyro", dt=0.5).recording
-    pace = np.linalg.norm(coarse.velocity[0, 1:, 0], axis=1)
+    pace = norm(coarse.velocity[0, 1:, 0], axis=1)
     assert np.nanmax(np.abs(pace - np.interp(coarse.t[1:], T, speed))) < 1.5
 
 
 @pytest.mark.parametrize("std", [0.05, 1.5])
 def test_the_speed_of_a_slow_robot_is_along_its_course(tmp_path, std):
-    pace = np.linalg.norm(np.gradient(path("robot"), 0.1, axis=0), axis=1)
+    pace = norm(np.gradient(path("robot"), 0.1, axis=0), axis=1)
     alone = error(log(tmp_path / "fixes", "robot", std, 10)[0], co.Kalman())
     assert error(log(tmp_path / "speed", "robot", std, 10, speed=pace)[0], co.Kalman()) < 1.1 * alone
 
@@ -217,7 +219,7 @@ def test_a_course_that_is_held_without_fixes_is_lost_on_bends(tmp_path, method):
     read = log(tmp_path, "car", 1.5, 10, steps=TUNNEL, speed=SPEED)[0]
     track = method(read.recording)
     behind = np.flatnonzero(read.recording.t > 92)
-    off = np.linalg.norm(track.x[0, behind, 0] - read.truth.position[behind, 0], axis=1)
+    off = norm(track.x[0, behind, 0] - read.truth.position[behind, 0], axis=1)
     assert np.sqrt(np.mean(off**2)) < 3.0
     assert np.nanmean(co.nees(track, read.truth)) < 4.0
 
@@ -298,7 +300,7 @@ def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     known = np.flatnonzero(np.isfinite(rec.gnss[0, :, 0, 0]))
     assert len(known) == len(t)
     for method in FILTERS:
-        far = np.linalg.norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)
+        far = norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)
         assert (far[4:] < 2.6).all()
 
 

@@ -16,6 +16,7 @@ import pytest
 from conftest import measured, refused
 from fuzz.good_files import sentence
 from logs import drive
+from numpy.linalg import norm
 from numpy.testing import assert_allclose
 
 import coopoc as co
@@ -61,7 +62,7 @@ def test_nmea_is_fixes_speed_and_course(tmp_path):
     (tmp_path / "a.nmea").write_text(nmea(fleet, 0, start, rmc=False))
     rec = read_log(tmp_path / "a.nmea", origin=(48.14, 11.58, 560.0)).recording
     assert len(rec.t) == 100
-    assert np.linalg.norm(rec.velocity[0, 5:-5, 0], axis=-1) == pytest.approx(8.0, abs=0.2)
+    assert norm(rec.velocity[0, 5:-5, 0], axis=-1) == pytest.approx(8.0, abs=0.2)
 
 
 def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path):
@@ -83,7 +84,7 @@ def test_a_real_car_that_stops_keeps_all_its_fixes():
     log = read_log(measured("ublox_f9k.nmea"), truth=measured("span_truth.gga"))
     assert log.summary.read == {"fixes": 1653}
     assert list(log.summary.refused) == ["damaged NMEA sentences"]
-    error = np.linalg.norm((log.recording.gnss[0] - log.truth.position)[..., :2], axis=-1)
+    error = norm((log.recording.gnss[0] - log.truth.position)[..., :2], axis=-1)
     assert np.nanmedian(error) == pytest.approx(0.49, abs=0.05)  # stated by those who published it
 
 
@@ -205,10 +206,10 @@ def test_motion_capture_and_radios_of_a_public_bag():
             t, ranges = np.array(rows).T
             a, b = (way[f"turtlebot{part[2:]}"] for part in topic.split("/")[3:5])
             gap = [np.interp(t, a[:, 0], a[:, d]) - np.interp(t, b[:, 0], b[:, d]) for d in (1, 2, 3)]
-            errors.append(ranges - np.linalg.norm(gap, axis=0))
+            errors.append(ranges - norm(gap, axis=0))
     links = log.recording.links
     ends = log.recording.gnss[0, links.step, links.observer] - log.recording.gnss[0, links.step, links.neighbour]
-    mine = log.recording.relative[0, :, 0] - np.linalg.norm(ends, axis=1)
+    mine = log.recording.relative[0, :, 0] - norm(ends, axis=1)
     assert np.nanmedian(mine) == pytest.approx(np.median(np.concatenate(errors)), abs=0.01)
     assert np.isfinite(log.recording.relative[0, :, 0]).sum() > 0.95 * sum(map(len, errors))
 

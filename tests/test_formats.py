@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from conftest import DIMENSIONS, measured
 from graph_files import write_graph
+from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import mmread
 from scipy.spatial.transform import Rotation
@@ -36,7 +38,7 @@ def assert_same(a: Any, b: Any, rtol: float = 0):
 def random_graph(dimension: int, seed: int) -> Graph:
     """All kinds of edges with full covariances, axes in m and rad scaled apart."""
     names = ("A0", "L5", "A1", "B0", "L7", "B1")
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     size, turn = (3, 1) if dimension == 2 else (6, 4)
     is_pose = np.array([name[0] != "L" for name in names])
     poses, points = np.flatnonzero(is_pose), np.flatnonzero(~is_pose)
@@ -45,7 +47,7 @@ def random_graph(dimension: int, seed: int) -> Graph:
         if dimension == 2:
             return rng.uniform(-7, 7, (count, 1))
         q = rng.normal(size=(count, 4))
-        return q / np.linalg.norm(q, axis=1, keepdims=True)
+        return q / norm(q, axis=1, keepdims=True)
 
     def cov(count, rows):
         root = rng.normal(size=(count, rows, 2 * rows)) * np.logspace(0, -2, rows)[:, None]
@@ -117,19 +119,19 @@ def test_relative_poses_and_points_are_in_the_frame_of_the_first():
     for edges, bound in ((graph.relative_pose, 0.02), (graph.relative_point, 0.2)):
         i, j = edges.nodes.T
         seen = np.einsum("mji,mj->mi", graph.rotation[i], graph.position[j] - graph.position[i])
-        assert np.median(np.linalg.norm(seen - edges.position, axis=1)) < bound
+        assert np.median(norm(seen - edges.position, axis=1)) < bound
     i, j = graph.relative_pose.nodes.T
     turned = graph.rotation[i].swapaxes(-1, -2) @ graph.rotation[j]
-    assert np.median(np.linalg.norm(turned - graph.relative_pose.rotation, axis=(1, 2))) < 0.02
+    assert np.median(norm(turned - graph.relative_pose.rotation, axis=(1, 2))) < 0.02
     i, j = graph.ranges.nodes.T
-    distance = np.linalg.norm(graph.position[i] - graph.position[j], axis=1)
+    distance = norm(graph.position[i] - graph.position[j], axis=1)
     assert np.median(np.abs(distance - graph.ranges.distance)) < 0.15
 
 
 @DIMENSIONS
 @pytest.mark.parametrize("seed", range(5))
 def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path, dimension, seed):
-    graph, rng = replace(random_graph(dimension, seed), fixed=()), np.random.default_rng(seed)
+    graph, rng = replace(random_graph(dimension, seed), fixed=()), default_rng(seed)
     timed = {kind: replace(e := getattr(graph, kind), stamps=rng.uniform(0, 2e9, len(e))) for kind in ENDS}
     graph = replace(graph, stamps=np.where(graph.is_pose, rng.uniform(0, 2e9, 6), np.nan), **timed)
     assert_same(written(graph, tmp_path / "a.pyfg"), graph)
@@ -167,7 +169,7 @@ def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str
 @DIMENSIONS
 def test_we_read_what_gtsam_writes(tmp_path, dimension):
     gtsam = pytest.importorskip("gtsam")
-    rng = np.random.default_rng(dimension)
+    rng = default_rng(dimension)
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     pose, between, size = (
         (gtsam.Pose2, gtsam.BetweenFactorPose2, 3) if dimension == 2 else (gtsam.Pose3, gtsam.BetweenFactorPose3, 6)
@@ -197,7 +199,7 @@ def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it():
     seen = [factors.at(k) for k in range(factors.size()) if "BearingRange" in type(factors.at(k)).__name__]
     assert len(seen) == len(graph.relative_point) == 80
     distance = [f.measured().range() for f in seen]
-    assert_allclose(np.linalg.norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
+    assert_allclose(norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
 
 
 def test_a_graph_cannot_be_changed_and_lists_its_robots():
@@ -209,7 +211,7 @@ def test_a_graph_cannot_be_changed_and_lists_its_robots():
 
 
 def test_rotations_are_scipys():
-    q = np.random.default_rng(0).normal(size=(500, 4))
+    q = default_rng(0).normal(size=(500, 4))
     q[:8] = [*np.eye(4), [0, 0, 0, -1], [1, 1, 0, 0], [0, 1, 1, 0], [1, 0, 0, 1e-9]]
     turned = Rotation.from_quat(q)
     assert_allclose(to_rotation(q), turned.as_matrix(), atol=1e-14)

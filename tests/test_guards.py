@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import formation_fleet, refused, winding
+from numpy.linalg import norm
 from scipy.stats import chi2
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, NoiseModel, Recording, Sensors, observe
@@ -35,7 +36,7 @@ def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table():
     blind = Kalman(NoiseModel("blind", process_std=(1e-6,) * 3, gnss_std=(1e3,) * 3))
     fast = replace(recording, velocity=10.0 * recording.velocity)
     track = blind(fast)
-    far = np.linalg.norm(track.x - fast.gnss, axis=-1).max() / np.linalg.norm(fast.sensors.gnss_std)
+    far = norm(track.x - fast.gnss, axis=-1).max() / norm(fast.sensors.gnss_std)
     assert far > 100
     assert far_off(track.x, fast, [0]).all()
     assert track.notes[0].startswith("fixes, a: far from its estimates; ")
@@ -83,7 +84,7 @@ def test_a_filter_is_back_within_five_seconds_of_the_end_of_an_attack(method, dt
     recording = observe(drive, Sensors(gnss_std=(1.5,) * 3, velocity_std_ratio=0.1), V2X(0), runs=20)
     off = 15.0 * ((t >= 20.0) & (t < 50.0))[:, None, None] * [1.0, 0.0, 0.0]
     gap = method(replace(recording, gnss=recording.gnss + off)).x - method(recording).x
-    moved: Floats = np.linalg.norm(gap, axis=-1)[..., 0].mean(axis=0)
+    moved: Floats = norm(gap, axis=-1)[..., 0].mean(axis=0)
     assert moved[(t > 45.0) & (t < 50.0)].max() > 10.0
     assert moved[(t >= 55.0) & (t < 65.0)].max() < 1.5
 

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from numpy.linalg import inv, solve
 from shell import python
 
 from coopoc.arrays import Floats
@@ -57,13 +58,13 @@ def test_blocks_against_numpy(batched):
     solved(mine, right, memory)
     lanes = [(..., k) for k in range(LANES)] if batched else [...]
     for lane in lanes:
-        assert right[lane] == pytest.approx(np.linalg.solve(a, eta), rel=1e-10)
+        assert right[lane] == pytest.approx(solve(a, eta), rel=1e-10)
         last = -memory[lane][: d * d].reshape(d, d)
-        assert last == pytest.approx(np.linalg.inv(a)[-d:, -d:], rel=1e-10)
+        assert last == pytest.approx(inv(a)[-d:, -d:], rel=1e-10)
 
     mine = shape(blockwise(a, d))
     predicted(mine, shape(1.0 / process), memory)
-    expected = np.linalg.inv(np.linalg.inv(a) + np.diag(process)).reshape(BLOCKS, d, BLOCKS, d).swapaxes(1, 2)
+    expected = inv(inv(a) + np.diag(process)).reshape(BLOCKS, d, BLOCKS, d).swapaxes(1, 2)
     for lane in lanes:
         found = mine[lane].reshape(BLOCKS, BLOCKS, d, d)
         for i in range(BLOCKS):

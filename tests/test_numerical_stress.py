@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import textbook
 from logs import NOISE, drive
+from numpy.random import default_rng
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS
@@ -27,7 +28,7 @@ def in_line(count: int, gap: float, offset: float = 0.0) -> co.Fleet:
 
 def drawn(seed: int) -> tuple[co.Fleet, co.Sensors]:
     """A fleet in line or scattered, each standard deviation anywhere within eight orders of magnitude."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     gap, count = float(10 ** rng.uniform(0.5, 2)), int(rng.integers(2, 7))
     fleet = in_line(count, gap)
     if rng.uniform() < 0.5:
@@ -66,7 +67,7 @@ def situations() -> Iterator[tuple[str, co.Fleet, co.Sensors]]:
     yield "collinear", in_line(8, 10.0), poor
     yield "collinear, closer than the range's noise", in_line(8, 3.0), poor
     spread = in_line(5, 0.0)
-    place = np.random.default_rng(4).normal(0.0, 15.0, (5, 3)) * [1.0, 1.0, 0.3]
+    place = default_rng(4).normal(0.0, 15.0, (5, 3)) * [1.0, 1.0, 0.3]
     spread = replace(spread, position=spread.position + place)
     for fix, std in (((264.0, 333.0, 390.0), (1.1e-4, 0.012, 0.092)), ((645.0, 113.0, 15.0), (20.0, 3e-5, 0.01))):
         noise = dict(zip(("range_std", "azimuth_std", "inclination_std"), std, strict=True))
@@ -157,7 +158,7 @@ def test_a_fine_range_in_a_coarse_direction_is_not_taken_for_exact(range_std, an
     6, 31 and 2 m, where a filter of the ego alone is 0.7 m off; and claims centimetres."""
     drives = []
     for seed in (1, 2):
-        fleet, rng = in_line(4, 0.0), np.random.default_rng(seed)
+        fleet, rng = in_line(4, 0.0), default_rng(seed)
         place = rng.uniform(-20, 20, (1, 4, 3)) * [1.0, 1.0, 0.0]
         fleet = replace(fleet, position=fleet.position + place)
         sensors = co.Sensors((1.5, 1.5, 1.5), range_std=range_std, azimuth_std=angle_std, inclination_std=angle_std)
@@ -178,7 +179,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain():
     alone is 0.7 m off."""
     drives = []
     for seed in (1, 2, 3):
-        rng, t = np.random.default_rng(seed), np.arange(60) / 10
+        rng, t = default_rng(seed), np.arange(60) / 10
         heading = rng.uniform(0, 2 * np.pi, 4) + np.cumsum(rng.normal(0, 0.02, (60, 4)), 0)
         velocity = 8.0 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], -1)
         position = np.append(rng.uniform(-20, 20, (4, 2)), np.zeros((4, 1)), 1) + np.cumsum(velocity / 10, 0)
@@ -197,7 +198,7 @@ def test_ranges_between_rare_fixes_say_no_more_than_where_they_point():
     fleet = drive(3, 600, 0.2, gap=12.0)
     seen = co.observe(fleet, NOISE, co.V2X(5), runs=6)
     rare = np.where(np.arange(600)[:, None, None] % 100, np.nan, seen.gnss)
-    velocity = seen.velocity + np.random.default_rng(0).normal(0, 0.1, seen.velocity.shape)
+    velocity = seen.velocity + default_rng(0).normal(0, 0.1, seen.velocity.shape)
     seen = without_azimuth(replace(seen, gnss=rare, velocity=velocity))
     error = errors_of("kalman joint", "100 ranges of a pair to a fix", [(fleet, seen)])
     assert all(each <= error["kalman"] for each in error.values()), error

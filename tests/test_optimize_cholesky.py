@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from numpy.linalg import eigvalsh, inv, solve
+from numpy.random import default_rng
 from scipy.sparse import csc_matrix, triu
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -13,7 +15,7 @@ from coopoc.workers import one_thread
 
 def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
     """J^T J of a chain of nodes and of random pairs, each with a full block of rows; a prior on the first."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     k = np.arange(nodes - 1)
     ends = np.concatenate([np.c_[k, k + 1], rng.integers(0, nodes, (pairs, 2))])
     J = np.zeros((len(ends) + 1, width, nodes, width))
@@ -42,10 +44,10 @@ def test_it_solves_and_inverts_as_numpy_does(nodes, pairs, width):
     cholesky = Cholesky(pattern.indptr, pattern.indices, np.repeat(np.arange(nodes), width))
     for scale in (1.0, 3.0):  # the second factorisation uses the analysis of the first
         assert cholesky.factor(upper(scale * A).data)
-        rhs = np.random.default_rng(1).normal(size=len(A))
-        assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(scale * A, rhs), rel=1e-6, abs=1e-8)
+        rhs = default_rng(1).normal(size=len(A))
+        assert cholesky.solve(rhs) == pytest.approx(solve(scale * A, rhs), rel=1e-6, abs=1e-8)
         rows, columns = np.nonzero(A)
-        inverse = np.linalg.inv(scale * A)[rows, columns]
+        inverse = inv(scale * A)[rows, columns]
         assert cholesky.inverse(rows, columns) == pytest.approx(inverse, rel=1e-6, abs=1e-8)
 
 
@@ -53,7 +55,7 @@ def test_it_solves_and_inverts_as_numpy_does(nodes, pairs, width):
 def test_a_matrix_that_curves_downwards_is_refused(pairs):
     """The smallest eigenvalue is NumPy's; slightly above it the shifted matrix is indefinite, slightly below not."""
     A = graph_matrix(pairs, 90, pairs, 2)
-    least = np.linalg.eigvalsh(A)[0]
+    least = eigvalsh(A)[0]
     cholesky = Cholesky(upper(A).indptr, upper(A).indices)
     for share, definite in ((0.99, True), (1.01, False), (0.5, True)):
         assert cholesky.factor(upper(A - share * least * np.eye(len(A))).data) is definite
@@ -62,11 +64,11 @@ def test_a_matrix_that_curves_downwards_is_refused(pairs):
 def test_parts_that_nothing_joins_are_factored_apart():
     A = np.zeros((30, 30))
     A[:12, :12], A[12:, 12:] = graph_matrix(7, 4, 2, 3), graph_matrix(8, 6, 1, 3)
-    order = np.random.default_rng(0).permutation(30)
+    order = default_rng(0).permutation(30)
     pattern, rhs = upper(A[np.ix_(order, order)]), np.arange(30.0)
     cholesky = Cholesky(pattern.indptr, pattern.indices)
     assert cholesky.factor(pattern.data)
-    assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(A[np.ix_(order, order)], rhs), rel=1e-8)
+    assert cholesky.solve(rhs) == pytest.approx(solve(A[np.ix_(order, order)], rhs), rel=1e-8)
 
 
 def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():

@@ -7,6 +7,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
+from numpy.linalg import inv, norm
+from numpy.random import default_rng
 from random_graphs import AB, PAIR
 from scipy.linalg import null_space
 from scipy.optimize import LinearConstraint, NonlinearConstraint, lsq_linear, minimize
@@ -69,7 +71,7 @@ def gradient(problem: Problem, x: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_fix_on_a_plane_is_projected(seed):
     """Closed form: x = p - S n (n.p - c) / (n.S n), covariance S - S n n^T S / (n.S n)."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     n, p, c, std = rng.normal(size=3), rng.normal(size=3) * 5, rng.normal(), rng.uniform(1, 4, 3)
     S = np.diag(std**2)
     problem = Problem(("a",)).add("position", "a", p, std=std).constrain("plane", "a", c, c, constants=n)
@@ -81,7 +83,7 @@ def test_a_fix_on_a_plane_is_projected(seed):
 
 def chain(points: int, seed: int) -> Problem:
     """A random walk with odometry 100 times as sure as the fixes: a linear problem."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     truth = np.cumsum(rng.normal(size=(points, 3)), axis=0)
     names = tuple(f"p{k}" for k in range(points))
     problem = Problem(names).add("position", names, truth + rng.normal(0, 3, truth.shape), std=3.0)
@@ -94,7 +96,7 @@ def test_a_linear_problem_in_a_box_is_scipys(seed, backend):
     """scipy.optimize.lsq_linear (BVLS); with bounds alone x - clip(x - gradient) vanishes at the minimum."""
     problem = chain(12, seed)
     free = solve(problem).x
-    lower, upper = free - 0.2, free + np.random.default_rng(seed).uniform(-0.15, 0.5, free.shape)
+    lower, upper = free - 0.2, free + default_rng(seed).uniform(-0.15, 0.5, free.shape)
     r, J = problem.whiten(np.zeros_like(free))
     found = lsq_linear(J.toarray(), -r, (lower.ravel(), upper.ravel()), method="bvls", tol=1e-15)
     solution = solved(problem.constrain("position", problem.names, lower, upper), backend)
@@ -120,7 +122,7 @@ def test_constraints_that_do_not_push_change_nothing(dense, length, backend):
 
 def drive(seed: int, vehicles: int = 2, steps: int = 4) -> Problem:
     """Vehicles on the road, with fixes, odometry that runs ahead and ranging to the one in front."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     t = 0.5 * np.arange(steps)[:, None]
     x, y = 14.0 * t - 20.0 * np.arange(vehicles), 0.0 * t + np.zeros(vehicles)
     truth = np.stack([x, y, road(x, y)], axis=-1)
@@ -163,11 +165,11 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
         return jacobian
 
     def speed(flat):
-        return np.linalg.norm((ties @ flat).reshape(-1, 3), axis=1) / 0.5
+        return norm((ties @ flat).reshape(-1, 3), axis=1) / 0.5
 
     def speed_slope(flat):
         gap = (ties @ flat).reshape(-1, 3)
-        unit = gap / np.linalg.norm(gap, axis=1, keepdims=True)
+        unit = gap / norm(gap, axis=1, keepdims=True)
         return np.einsum("kc,kcn->kn", unit, ties.reshape(-1, 3, 3 * n)) / 0.5
 
     lane = np.eye(3 * n)[1::3]
@@ -195,7 +197,7 @@ def test_surface_lane_and_top_speed_are_scipys(seed):
     assert solution.cost == pytest.approx(cost, rel=1e-8)
     assert solution.x == pytest.approx(x, abs=1e-4)
     gone = solution.x[2:] - solution.x[:-2]
-    assert np.linalg.norm(gone, axis=1).max() == pytest.approx(7.0, abs=1e-6)  # the limit is met, not passed
+    assert norm(gone, axis=1).max() == pytest.approx(7.0, abs=1e-6)  # the limit is met, not passed
     assert solution.x[:, 2] == pytest.approx(road(solution.x[:, 0], solution.x[:, 1]), abs=1e-9)
     assert np.abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
 
@@ -209,7 +211,7 @@ def test_the_covariance_holds_equalities_exactly():
     for k, (x, _, _) in enumerate(solution.x):
         rows[k, 3 * k : 3 * k + 3] = -2.0 / 15.0 * np.cos(x / 15.0), -0.05, 1.0
     Z = null_space(rows)
-    cov = Z @ np.linalg.inv(Z.T @ (J.T @ J).toarray() @ Z) @ Z.T
+    cov = Z @ inv(Z.T @ (J.T @ J).toarray() @ Z) @ Z.T
     own = np.stack([cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(solution.x))])
     assert solution.covariance == pytest.approx(own, abs=1e-9)
 
@@ -237,7 +239,7 @@ def test_multipliers_are_those_of_ipopt():
 
 def test_poses_in_a_slab():
     """osqp holds bounds on positions of poses; casadi agrees, and a step of SciPy's BVLS around it moves nothing."""
-    rng, n = np.random.default_rng(0), 6
+    rng, n = default_rng(0), 6
     at = np.c_[5.0 * np.arange(n), rng.normal(0, 1, n)]
     turn = rng.normal(0, 0.3, n)
     c, s = np.cos(turn[:-1]), np.sin(turn[:-1])
@@ -373,10 +375,10 @@ def test_a_claim_is_verified_independently_of_the_solver(claim, status):
 @pytest.mark.parametrize("loss", [None, Loss("cauchy", 2.0)])
 def test_vehicles_between_kerbs_end_as_low_as_from_the_truth(loss):
     """Fixes of 15 m, ranges of 0.3 m, many minima; without an x0, and from one that is far off."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     truth = np.stack([rng.uniform(-30, 30, 6), rng.uniform(-4, 4, 6)], axis=1)
     pairs = rng.permutation(np.stack(np.triu_indices(6, 1), axis=1))[:10]
-    ranges = np.linalg.norm(truth[pairs[:, 0]] - truth[pairs[:, 1]], axis=1) + rng.normal(0, 0.3, 10)
+    ranges = norm(truth[pairs[:, 0]] - truth[pairs[:, 1]], axis=1) + rng.normal(0, 0.3, 10)
     problem = Problem(tuple("abcdef"), dimension=2).add("range", pairs, ranges, std=0.3, loss=loss)
     problem = problem.add("position", range(6), truth + rng.normal(0, 15, (6, 2)), std=15.0)
     problem = problem.constrain("position", range(6), lower=[-INF, -4], upper=[INF, 4])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import DIMENSIONS, measured, refused
 from hard_graphs import cropped
+from numpy.linalg import eigvalsh, norm
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import moved, random_drive, random_graph, scipys
 from scipy.sparse import csc_array
@@ -39,7 +40,7 @@ def test_a_newton_step_promises_the_square_of_its_decrement():
     step = 1e-5 * np.eye(len(moving))
     H = np.array([(gradient(e) - gradient(-e)) / 2e-5 for e in step])
     g = gradient(np.zeros(len(moving)))
-    assert np.linalg.eigvalsh(H).min() > 0
+    assert eigvalsh(H).min() > 0
     assert newton_decrease(problem, problem.x0) == pytest.approx(0.5 * g @ np.linalg.solve(H, g), rel=1e-5)
 
 
@@ -245,13 +246,13 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken():
     assert problem.cost(problem.x0) == pytest.approx(
         from_graph(replace(graph, ranges=replace(ranges, distance=[1e-9, 2.0]))).cost(problem.x0), rel=1e-6
     )
-    assert np.linalg.norm(gap) > 0
+    assert norm(gap) > 0
     start = from_graph(together, start="odometry").x0[:, :2]  # every pose without odometry is a root at the origin
-    assert np.linalg.norm(start[c] - start[b]) > 0
+    assert norm(start[c] - start[b]) > 0
     x0[c, :2] = x0[b, :2]  # far from the origin
     moved = directed(from_graph(together, start="odometry"), x0)
     assert np.flatnonzero((moved != x0).any(axis=1)).tolist() == [b, c]
-    assert 0 < np.linalg.norm((moved[c] - moved[b])[:2]) < 0.5
+    assert 0 < norm((moved[c] - moved[b])[:2]) < 0.5
 
 
 def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 from conftest import DIMENSIONS
+from numpy.random import default_rng
 from test_optimize_poses import everything
 
 from coopoc.optimize import Loss, Problem, pose, solve
@@ -14,7 +15,7 @@ LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 
 def nodes_of(dimension: int) -> Problem:
     """Three poses and two points somewhere."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     turn = rng.normal(size=(5, 3)) if dimension == 3 else rng.uniform(-3, 3, 5)
     x = pose(10 * rng.normal(size=(5, dimension)), turn)
     x[3:, dimension:] = np.eye(dimension).ravel()
@@ -22,7 +23,7 @@ def nodes_of(dimension: int) -> Problem:
 
 
 def spd(size: int, scale: float = 1.0) -> np.ndarray:
-    root = np.random.default_rng(2).normal(size=(size, size))
+    root = default_rng(2).normal(size=(size, size))
     return scale * (root @ root.T + np.eye(size))
 
 
@@ -34,7 +35,7 @@ def apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def measured(dimension: int, kind: str, nodes: list[tuple[str, ...]], noise: dict, loss: Loss | None = None) -> Problem:
     """One factor of a kind with z anywhere."""
-    problem, rng = nodes_of(dimension), np.random.default_rng(3)
+    problem, rng = nodes_of(dimension), default_rng(3)
     count = len(nodes)
     if "pose" in kind:
         turn = rng.normal(size=(count, 3)) if dimension == 3 else rng.normal(size=count)

@@ -7,6 +7,8 @@ from time import perf_counter
 import numpy as np
 import pytest
 from conftest import DESCENTS, measured, refused
+from numpy.linalg import inv, norm
+from numpy.random import default_rng
 from random_graphs import moved
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,7 @@ from coopoc.optimize.model.space import Space, exp, log
 
 def everything(dimension: int, noise: float = 0.05) -> tuple[Problem, np.ndarray]:
     """Two robots of four poses each and a landmark, with one factor of every kind that exists, and the truth."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     d, space = dimension, Space(dimension, has_rotation=True)
     names = (*(f"{robot}{k}" for robot in "AB" for k in range(4)), "L0")
     position = np.concatenate([np.arange(4)[:, None] * 5.0 + row * 8.0 + np.zeros((4, d)) for row in (0, 1)])
@@ -79,7 +81,7 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     assert found.x == pytest.approx(moved(problem, truth, theirs.x), abs=1e-6)
     J = problem.whiten(found.x)[1].toarray()[:, movable]
     cov = np.zeros((movable.size, movable.size))
-    cov[np.ix_(movable, movable)] = np.linalg.inv(J.T @ J)
+    cov[np.ix_(movable, movable)] = inv(J.T @ J)
     own = cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)]
     assert found.covariance == pytest.approx(own, abs=1e-9)
 
@@ -106,7 +108,7 @@ def small() -> Graph:
 
 
 def test_exp_and_log_are_scipys():
-    w = np.random.default_rng(0).normal(size=(40, 3))
+    w = default_rng(0).normal(size=(40, 3))
     w[0] = 0.0
     assert exp(w) == pytest.approx(Rotation.from_rotvec(w).as_matrix(), abs=1e-12)
     assert log(exp(w)) == pytest.approx(w, abs=1e-9)
@@ -151,7 +153,7 @@ def test_wrong_input_says_what_to_do(case):
 def test_poses_without_an_x0_are_found(kind, of, d):
     """Headings are not given: odometry is turned to where fixes of poses, or what is measured of points with fixes, put
     it."""
-    rng, n, space = np.random.default_rng(d), 30, Space(d, has_rotation=True)
+    rng, n, space = default_rng(d), 30, Space(d, has_rotation=True)
     truth = space.join(rng.normal(0, 9, (n + 4, d)), exp(rng.normal(size=(n + 4, space.angles))))
     problem, pairs = Problem(range(n + 4), dimension=d, poses=range(n)), [[k, n + k % 4] for k in range(n)]
     moves = [relative(space, truth, pair) for pair in pairwise(range(n))]
@@ -185,15 +187,15 @@ def test_a_graph_without_its_gauge_names_what_is_free():
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])
 def test_offsets_that_ranges_share_are_scipys(backend):
     """Of two anchors, 2 and -0.4 m, with a point per step: minimum and covariance of a residual written here."""
-    rng, steps = np.random.default_rng(4), 120
+    rng, steps = default_rng(4), 120
     path = np.cumsum(rng.normal(0.0, 2.0, (steps, 2)), axis=0)
     anchors, which = np.array([[20.0, 5.0], [-8.0, 15.0]]), np.arange(steps) % 2
     moved = np.diff(path, axis=0) + 0.05 * rng.normal(size=(steps - 1, 2))
-    r = np.linalg.norm(anchors[which] - path, axis=1) + np.take([2.0, -0.4], which) + 0.1 * rng.normal(size=steps)
+    r = norm(anchors[which] - path, axis=1) + np.take([2.0, -0.4], which) + 0.1 * rng.normal(size=steps)
 
     def residual(u):
         x, offset = u[:-2].reshape(-1, 2), u[-2:]
-        far = np.linalg.norm(anchors[which] - x, axis=1) + offset[which] - r
+        far = norm(anchors[which] - x, axis=1) + offset[which] - r
         return np.concatenate([((np.diff(x, axis=0) - moved) / 0.05).ravel(), far / 0.1, offset / 3.0])
 
     theirs = least_squares(residual, np.append(path, [0.0, 0.0]), xtol=1e-14, gtol=1e-12)
@@ -208,14 +210,14 @@ def test_offsets_that_ranges_share_are_scipys(backend):
     found = solve(problem.add("position", names[-2:], np.zeros((2, 2)), std=[3.0, 1.0]), backend)
     assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
     assert found.x[-2:, 0] == pytest.approx(theirs.x[-2:], abs=1e-5)
-    std = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac))[-2:])
+    std = np.sqrt(np.diag(inv(theirs.jac.T @ theirs.jac))[-2:])
     assert np.sqrt(found.covariance[-2:, 0, 0]) == pytest.approx(std, rel=1e-4)
     assert (np.abs(found.x[-2:, 0] - [2.0, -0.4]) < 4 * std).all()
 
 
 def test_what_no_start_knows_is_drawn():
     """Azimuths in the world place landmarks; without noise the truth costs nothing."""
-    rng, space = np.random.default_rng(38), Space(2, has_rotation=True)
+    rng, space = default_rng(38), Space(2, has_rotation=True)
     h = np.cumsum(rng.normal(0, 0.3, 6))
     at = np.cumsum(2 * np.exp(1j * h))
     marks = at.mean() + rng.uniform(-8, 8, 3) + 1j * rng.uniform(-8, 8, 3)

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused
+from numpy.random import default_rng
 from oracles.whitened import whitened
 from random_graphs import AB, PAIR
 
@@ -26,7 +27,7 @@ def recording(crossing):
 
 def mixed() -> Problem:
     """One factor of every kind, with std per component, per row and a full root."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     p = Problem("abcd", x0=rng.normal(size=(4, 3)) * 10)
     p = p.add("position", list("abcd"), rng.normal(size=(4, 3)) * 10, std=rng.uniform(1, 3, (4, 3)))
     p = p.add("displacement", AB, [5, 1, 0], sqrt_information=np.tril(rng.uniform(0.5, 1, (3, 3))))
@@ -64,7 +65,7 @@ def test_window_chains_who_stays(recording):
 def test_the_noise_model_sets_the_weights(recording):
     nominal = Problem.from_window(recording, 20, 0, 3)
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))
-    x = np.random.default_rng(0).normal(size=(len(nominal.names), 3)) * 30
+    x = default_rng(0).normal(size=(len(nominal.names), 3)) * 30
     assert stated.cost(x) == pytest.approx(nominal.cost(x), rel=1e-12)
     unsure = replace(recording, motion_variance=np.full(recording.broadcasts.shape, 9.0))
     more = Problem.from_window(unsure, 20, 0, 3)
@@ -199,7 +200,7 @@ def test_a_start_is_the_least_squares_of_the_converted_vectors(recording):
 
 def test_fine_measurements_do_not_hide_what_is_free():
     """What rounding leaves of J^T J along a free direction looks like a variance of 1e-8 m^2."""
-    for fine in np.random.default_rng(0).uniform(1e-4, 2e-4, (60, 3, 3)):
+    for fine in default_rng(0).uniform(1e-4, 2e-4, (60, 3, 3)):
         free = Problem("ab").add("displacement", [(0, 1)] * 3, fine, std=fine)
         assert solve(free, throw=False).status is Status.RANK_DEFICIENT
 
@@ -207,7 +208,7 @@ def test_fine_measurements_do_not_hide_what_is_free():
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
 def test_a_point_that_can_turn_around_another_is_free(backend):
     """One range leaves two of its three directions open, and the rounding of J^T J does not hide it."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     for _ in range(20):
         x0 = np.concatenate([[[0, 0, 0], [9, 0, 0]], rng.normal(0, 9, (1, 3))])
         hanging = Problem(("a", "b", "c"), PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
@@ -222,7 +223,7 @@ def incomplete():
     """Half of the fixes are missing; of the relative measurements some all, some the azimuth, some the range."""
     fleet = load_fleet("town10").between(0, 30)
     seen = observe(fleet, Sensors.paper_scenario2(), V2X(6), runs=4, observers=[5])
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     gnss, relative = seen.gnss.copy(), seen.relative.copy()
     gnss[rng.random(gnss.shape[:3]) < 0.5] = np.nan
     for part, share in ((slice(None), 0.1), (1, 0.1), (slice(1, 3), 0.1), (0, 0.05)):

@@ -12,6 +12,7 @@ import pytest
 import range_only
 import tightness
 from conftest import measured, refused
+from numpy.random import default_rng
 from random_graphs import scipys
 from scipy.io import mmread
 from scipy.optimize import least_squares
@@ -37,7 +38,7 @@ swarm = partial(tightness.ranged, vehicles=4, mesh=True)
 def two_robots(seed: int, d: int = 2, fixed: bool = False, prior: bool = False) -> Problem:
     """Odometry of two robots as chordal relative poses and ranges between them; nothing in the world's frame, but a
     prior of the first pose."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     w = World(rng, rng.uniform(-5, 5, (8, d)), exp(rng.uniform(-3, 3, (8, 2 * d - 3))), robots=2, steps=4)
     odometry, ranges = w.relative(w.chain(), 0.05, 0.02), w.ranged(w.near(16, 30.0, others=True), 0.1)
     whole = from_graph(w.graph(relative_pose=odometry, ranges=ranges), "chordal", "file")
@@ -47,7 +48,7 @@ def two_robots(seed: int, d: int = 2, fixed: bool = False, prior: bool = False) 
 
 def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
     """Smallest cost that scipy finds from random starts, over positions or, in the plane, positions and headings."""
-    rng, n, d = np.random.default_rng(0), len(problem.names), problem.dimension
+    rng, n, d = default_rng(0), len(problem.names), problem.dimension
 
     def system(y):
         rows = y.reshape(n, -1)
@@ -155,7 +156,7 @@ def test_no_point_beats_the_bounds(make, seed):
     relaxation = shor(problem)
     assert 0 < relaxation.seconds <= time.perf_counter() - began
     best = relaxation.lower_bound
-    rng, space = np.random.default_rng(seed), problem.space
+    rng, space = default_rng(seed), problem.space
     for _ in range(50):
         turned = np.linalg.qr(rng.standard_normal((len(problem.names), problem.dimension, problem.dimension)))[0]
         turned[:, :, 0] *= np.sign(np.linalg.det(turned))[:, None]
@@ -194,7 +195,7 @@ def test_the_elimination_is_numpys(make, monkeypatch):
         [np.eye(form.bound), -np.linalg.lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]]
     )
     C = rest.T @ rest
-    X = form.project(np.random.default_rng(0).standard_normal((form.bound, form.columns)))
+    X = form.project(default_rng(0).standard_normal((form.bound, form.columns)))
     assert small.matrix == pytest.approx(C, abs=1e-9 * np.abs(C).max())
     assert small.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
     assert np.square(A @ small.settle(X)).sum() == pytest.approx(np.sum(X * (C @ X)), rel=1e-9)
@@ -237,7 +238,7 @@ def test_what_has_no_relaxation_is_refused():
 
 def minima(problem: Problem, starts: int = 15) -> list[Solution]:
     """The minima that Gauss-Newton reaches from random starts, the lowest first."""
-    rng, found = np.random.default_rng(0), []
+    rng, found = default_rng(0), []
     for _ in range(starts):
         x0 = rng.uniform(-20, 20, (len(problem.names), problem.dimension))
         solution = solve(replace(problem, x0=x0, search=Search("random", x0=x0)), throw=False)
@@ -263,7 +264,7 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed):
         assert refused.lower_bound <= best.cost
         assert refused.smallest_eigenvalue < -1e-3
         assert str(refused).startswith("not certified")
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     for _ in range(8):
         assert scipys(problem, rng.uniform(-20, 20, (6, 2))).cost >= verdict.lower_bound * (1 - 1e-9)
 

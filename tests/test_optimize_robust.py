@@ -7,6 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from oracles.whitened import LOSSES, hessian
 from scipy.optimize import least_squares
 from scipy.stats import chi2
@@ -33,7 +34,7 @@ def test_losses_and_weights_are_gtsams(name, scale):
 def native(seed: int, wrong: int = 0, loss: Loss | None = None) -> Problem:
     """Twelve points that GTSAM has factors for: a walk with odometry, three ranges to its start, two fixes of each
     point, of which the first `wrong` second ones are tens of metres off."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     truth = np.cumsum(rng.normal(0, 4, (12, 3)), axis=0)
     fixes = truth + rng.normal(size=(2, 12, 3))
     fixes[1, :wrong] += rng.uniform(15, 40, (wrong, 3)) * rng.choice([-1, 1], (wrong, 3))
@@ -49,7 +50,7 @@ def native(seed: int, wrong: int = 0, loss: Loss | None = None) -> Problem:
 
 def observed(name: str, seed: int) -> Problem:
     """Two points among four that are held, by robust measurements of one number each, a third of them wrong."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     anchors = np.array([[0, 0, 0], [30, 0, 2], [0, 30, 4], [30, 30, 9.0]])
     truth = rng.uniform(8, 22, (2, 3)) * [1, 1, 0.5]
     x0 = np.concatenate([anchors, truth + rng.normal(0, 0.5, (2, 3))])
@@ -75,7 +76,7 @@ def test_scipy_finds_the_same_robust_minimum(name, seed):
 
     printed = {"geman-mcclure": lambda s: np.stack([s / (1 + s), (1 + s) ** -2.0, -2 * (1 + s) ** -3.0])}
     loss, ours = printed.get(name, name), solve(problem)
-    near = ours.x[4:] + np.random.default_rng(seed).normal(0, 0.1, (2, 3))
+    near = ours.x[4:] + default_rng(seed).normal(0, 0.1, (2, 3))
     exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-12}
     tries = [
         least_squares(residual, start.ravel(), "3-point", loss=loss, f_scale=1.2, **exact)
@@ -91,7 +92,7 @@ def test_the_robust_curvature_is_casadis():
     signs = []
     for seed, name in itertools.product(range(8), LOSSES):
         problem = native(seed, wrong=2, loss=Loss(name, 2.5))
-        x = problem.x0 + np.random.default_rng(seed).normal(0, 0.25 + 0.05 * seed, problem.x0.shape)
+        x = problem.x0 + default_rng(seed).normal(0, 0.25 + 0.05 * seed, problem.x0.shape)
         lowest = np.linalg.eigvalsh(hessian(problem, x)).min()
         assert abs(lowest) > 1e-4
         assert (newton_decrease(problem, x) is not None) == (lowest > 0)

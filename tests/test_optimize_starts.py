@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import DESCENTS
+from numpy.linalg import norm
+from numpy.random import default_rng
 from random_graphs import random_drive, scipys
 from unseen_graphs import lost, ranged_drives, world
 
@@ -55,7 +57,7 @@ def beside(graph: Graph) -> list[Solution]:
 
 def test_ranges_that_are_eased_lead_from_bad_odometry():
     """As low as from the truth, which the graph does not hold."""
-    w, rng = world(2, 2, 2, 250), np.random.default_rng(2)
+    w, rng = world(2, 2, 2, 250), default_rng(2)
     pairs = np.sort(rng.integers(0, 500, (500, 2)), axis=1)
     moved = w.relative(w.chain(), 0.3, 0.15)
     graph = w.graph(relative_pose=moved, ranges=w.ranged(pairs[pairs[:, 0] < pairs[:, 1]], 0.2))
@@ -73,11 +75,11 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
     that is far off never without one."""
     left, loss = 0, Loss("truncated", 3.0) if case == "a wrong fix" else None
     for seed in range(6):
-        rng, nodes = np.random.default_rng(seed), 6 + (case == "an offset")
+        rng, nodes = default_rng(seed), 6 + (case == "an offset")
         truth = rng.uniform(-20, 20, (nodes, 3)) * [1, 1, 0.1]
         i, j = np.triu_indices(6, 1)
         apart, many = truth[j] - truth[i], 6 if case in ("fixes of all", "a wrong fix") else 3
-        std, z = 0.3 if many == 3 else 6.0, np.linalg.norm(apart, axis=1) + 0.2 * rng.normal(size=15)
+        std, z = 0.3 if many == 3 else 6.0, norm(apart, axis=1) + 0.2 * rng.normal(size=15)
         fixes = truth[:many] + std * rng.normal(size=(many, 3))
         fixes[-1] += 100.0 * (case == "a wrong fix")
         problem = Problem("abcdefo"[:nodes]).add("position", range(many), fixes, std=std, loss=loss)
@@ -86,7 +88,7 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
             problem = problem.add("position", [6], [[0, 0, 0]], std=[90.0, 1.0, 1.0])
             problem = problem.add("range_offset", pairs, z - 30.0, std=0.2).add("range", (3, 4), z[12], std=0.2)
         elif case == "inclinations":
-            z = np.arccos(apart[:, 2] / np.linalg.norm(apart, axis=1)) + 0.01 * rng.normal(size=15)
+            z = np.arccos(apart[:, 2] / norm(apart, axis=1)) + 0.01 * rng.normal(size=15)
             problem = problem.add("inclination", pairs[:, :2], z, std=0.01)
         else:
             problem = problem.add("range", pairs[:, :2], z, std=0.2)
@@ -105,10 +107,10 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
 
 
 def test_exact_ranges_end_at_the_truth_without_a_word():
-    truth = np.random.default_rng(0).uniform(0, 100, (8, 3))
+    truth = default_rng(0).uniform(0, 100, (8, 3))
     pairs = np.column_stack(np.triu_indices(8, 1))
     problem = Problem("abcdefgh").add("position", range(5), truth[:5], std=0.1)
-    z = np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2))
+    z = norm(np.diff(truth[pairs], axis=1), axis=(1, 2))
     problem = problem.add("range", pairs, z, std=0.1)
     found = solve(problem)
     assert ranges_of(problem, truth).cost(z[:, None], np.arange(28)) == 0.0
@@ -119,10 +121,10 @@ def test_exact_ranges_end_at_the_truth_without_a_word():
 def outliers(seed: int) -> tuple[Problem, Floats, Floats]:
     """A network of 30 points in the plane from anywhere, with a tenth of its ranges too long; its truth, and which
     these are."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     truth = np.concatenate([[[0, 0], [100, 0], [0, 100], [100, 100]], rng.uniform(0, 100, (26, 2))])
     i, j = np.triu_indices(30, 1)
-    length = np.linalg.norm(truth[i] - truth[j], axis=1)
+    length = norm(truth[i] - truth[j], axis=1)
     rows = np.flatnonzero((length < 40) & (j > 4))
     bad = rng.random(len(rows)) < 0.1
     z = length[rows] + 0.3 * rng.normal(size=len(rows)) + bad * rng.uniform(5, 40, len(rows))
@@ -187,7 +189,7 @@ def test_a_walk_counts_beyond_what_32_bits_hold():
     n = 50_000
     position, _, known = walk(ring(n, 0.0), np.ones(n, bool), [(0, np.zeros(2), np.eye(2))])
     assert known.all()
-    assert np.allclose(np.linalg.norm(np.diff(position, axis=0), axis=1), 1.0)
+    assert np.allclose(norm(np.diff(position, axis=0), axis=1), 1.0)
 
 
 def ring(n: int, wrong: float) -> Graph:
@@ -211,7 +213,7 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
     """Errors of a ring that sum to 1.5 rad, of two thousand that sum to thousands, or to a whole turn."""
     problem, space = from_graph(ring(2000, 0.0), start="odometry"), Space(2, has_rotation=True)
     course = 2 * np.pi * np.arange(2000) / 2000
-    shaken = course + 0.5 * np.random.default_rng(0).choice([-1.0, 1.0], 2000)
+    shaken = course + 0.5 * default_rng(0).choice([-1.0, 1.0], 2000)
     for turns, expected in (
         (course, True),
         (course + 1.5 * course / (2 * np.pi), True),
@@ -227,7 +229,7 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
 def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, backend):
     """Costs that noise may explain lead from there, 49 for 25 and 34 for 21: without a note before."""
     graph = random_drive(seed, d, loops=8, turn_std=0.3)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     truth = from_graph(graph, "geodesic", start="file")
     far = truth.space.retract(truth.x0, 2 * rng.normal(size=truth.movable.shape) * truth.movable)
     found = solve(replace(truth, x0=far), backend)
@@ -237,7 +239,7 @@ def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, bac
 
 def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     """Bad odometry and random ranges: most steps move what is new alone; against the descent from the truth."""
-    drive, rng, sizes = world(0, 2, 1, 300), np.random.default_rng(1), list[int]()
+    drive, rng, sizes = world(0, 2, 1, 300), default_rng(1), list[int]()
     pairs = rng.integers(0, 300, (700, 2))
     pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 1][:600]
     edges = drive.relative(drive.chain(), 0.1, 0.05)
@@ -258,7 +260,7 @@ def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
 @pytest.mark.parametrize("d", [2, 3])
 def test_robots_that_see_one_another_turn_to_what_they_see(d):
     """Of six with unknown headings each sees two others; the truth leads no lower."""
-    rng, space = np.random.default_rng(1), Space(d, has_rotation=True)
+    rng, space = default_rng(1), Space(d, has_rotation=True)
     truth = space.join(rng.uniform(-25, 25, (6, d)), exp(rng.uniform(-1.7, 1.7, (6, space.angles))))
     problem = Problem(tuple("abcdef"), dimension=d, poses=range(6), x0=truth)
     problem = problem.add("position", range(6), truth[:, :d] + rng.normal(0, 2, (6, d)), std=2.0)

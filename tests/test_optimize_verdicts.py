@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from conftest import DESCENTS
+from numpy.linalg import inv, norm
 from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
@@ -40,19 +41,19 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     angle = rng.uniform(0, np.pi)
     along = np.array([np.cos(angle), np.sin(angle)])
     anchors, truth = np.outer([0, 10, 25.0], along), along * rng.uniform(2, 20)
-    ranges = np.linalg.norm(anchors - truth, axis=1) + np.array([0.4, -0.4, -0.1])
+    ranges = norm(anchors - truth, axis=1) + np.array([0.4, -0.4, -0.1])
     problem = ranged(anchors, truth + rng.normal(0, 1, 2), ranges, 0.3)
     found = solve(problem)
-    theirs = least_squares(lambda p: (np.linalg.norm(anchors - p, axis=1) - ranges) / 0.3, problem.x0[3], xtol=1e-15)
+    theirs = least_squares(lambda p: (norm(anchors - p, axis=1) - ranges) / 0.3, problem.x0[3], xtol=1e-15)
     assert found.cost == pytest.approx(theirs.cost, rel=1e-6)
-    cost = lambda p: 0.5 * np.square((np.linalg.norm(anchors - p, axis=1) - ranges) / 0.3).sum()  # noqa: E731
+    cost = lambda p: 0.5 * np.square((norm(anchors - p, axis=1) - ranges) / 0.3).sum()  # noqa: E731
     h, x = 1e-3 * np.eye(2), found.x[3]
     hessian = [[cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b) for a in h] for b in h]
     singular = "J^T J is singular here: the covariance is that of the exact Hessian" in found.notes
     across = np.array([-along[1], along[0]])
     assert singular == (abs((x - truth) @ across) < 1e-4)
     if singular:
-        assert found.covariance[3] == pytest.approx(np.linalg.inv(np.array(hessian) / 4e-6), rel=1e-3)
+        assert found.covariance[3] == pytest.approx(inv(np.array(hessian) / 4e-6), rel=1e-3)
 
 
 @DESCENTS

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import among, refused
+from numpy.linalg import norm
 
 from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors, observe
 from coopoc.world.links import to_vector, wrap
@@ -60,7 +61,7 @@ def test_outliers_are_added_to_the_clean_draws(crossing, frame):
     assert abs(hit.mean() - 0.05) < 0.015
     assert longer[hit].min() + 1e-9 >= 3.0
     assert longer.max() < 20.0 + 1e-9
-    jump = np.linalg.norm(bad.gnss - clean.gnss, axis=-1)
+    jump = norm(bad.gnss - clean.gnss, axis=-1)
     assert abs(np.isnan(jump).mean() - 0.05) < 0.02
     assert abs((jump > 1e-9).mean() - 0.1 * 0.95) < 0.03
     assert jump[jump > 1e-9].min() + 1e-9 >= 10.0
@@ -77,7 +78,7 @@ def test_outliers_are_added_to_the_clean_draws(crossing, frame):
 
 def test_a_slip_is_a_share_of_the_true_motion(crossing):
     clean, bad = (seen(crossing, o, runs=20) for o in (Outliers(), ALL))
-    speed = np.linalg.norm(crossing.velocity, axis=-1)
+    speed = norm(crossing.velocity, axis=-1)
     share = np.einsum("rtni,tni->rtn", bad.velocity - clean.velocity, crossing.velocity) / speed**2
     wrong = np.abs(share) > 1e-9
     assert np.abs(share[wrong]).min() > 0.2 - 1e-6
@@ -99,9 +100,9 @@ def test_a_wrong_association_is_the_direction_of_the_nearest_other_vehicle(cross
     for run, link in np.argwhere(hit)[::7]:
         t, i, j = (int(side[link]) for side in (bad.links.step, bad.links.observer, bad.links.neighbour))
         place = crossing.position[t]
-        others = [k for k in range(len(place)) if k not in (i, j) and 2 <= np.linalg.norm(place[k] - place[i]) <= 30]
-        nearest = min(others, key=lambda k: np.linalg.norm(place[k] - place[j]))
-        expected = (place[nearest] - place[i]) / np.linalg.norm(place[nearest] - place[i])
+        others = [k for k in range(len(place)) if k not in (i, j) and 2 <= norm(place[k] - place[i]) <= 30]
+        nearest = min(others, key=lambda k: norm(place[k] - place[j]))
+        expected = (place[nearest] - place[i]) / norm(place[nearest] - place[i])
         assert direction[run, link] == pytest.approx(expected, abs=1e-6)
 
 

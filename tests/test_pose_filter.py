@@ -51,11 +51,18 @@ def rough(crossing):
 
 
 @pytest.mark.parametrize(
-    ("kind", "d", "exact"),
-    [("solo", 6, False), ("fleet", 4, True), ("fleet", 6, False), ("fleet", 7, True), ("fleet", 10, True)],
+    ("kind", "d", "exact", "arm"),
+    [
+        ("solo", 6, False, 1.0),
+        ("fleet", 4, True, 2.0),
+        ("fleet", 6, False, 0.0),
+        ("fleet", 7, True, 0.0),
+        ("fleet", 10, True, 0.5),
+    ],
 )
-def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact):
+def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact, arm):
     """Gaps, losses, members that come and go, landmarks, range only and bearing only; the first one without a fix."""
+    rough = replace(rough, tags=arm * np.eye(10)[:, [1, 0, 2]] + 0.3 * arm * (np.arange(10)[:, None] < 8))
     mine = rough.links.of(0)
     members = [0] if kind == "solo" else [1, 0, *range(2, 8)]
     links = to_landmarks(rough, mine) if kind == "solo" else np.arange(len(rough.links))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from conftest import refused
+from numpy.random import default_rng
 from scipy import stats
 from scipy.spatial.transform import Rotation
 from unseen_graphs import alignment_error
@@ -14,7 +15,7 @@ from coopoc.evaluate.statistics import mean_interval, over_seeds, paired_differe
 
 def test_one_ego_agrees_with_scipy_bootstrap(monkeypatch):
     monkeypatch.setattr(statistics, "RESAMPLES", 20000)
-    values = np.random.default_rng(0).gamma(4.0, 0.3, 200)
+    values = default_rng(0).gamma(4.0, 0.3, 200)
     ours = mean_interval(values)
     theirs = stats.bootstrap((values,), np.mean, n_resamples=20000, method="percentile", rng=1).confidence_interval
     width = theirs.high - theirs.low
@@ -25,7 +26,7 @@ def test_one_ego_agrees_with_scipy_bootstrap(monkeypatch):
 
 
 def test_pairing_cancels_what_both_share():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     shared = rng.normal(5, 2, (50, 4))
     a, b = shared + 0.1 + rng.normal(0, 0.05, shared.shape), shared
     difference = paired_difference(a, b)
@@ -36,7 +37,7 @@ def test_pairing_cancels_what_both_share():
 
 @pytest.mark.parametrize(("egos", "runs", "between", "low"), [(1, 40, 0.0, 0.90), (8, 20, 1.0, 0.88)])
 def test_intervals_hold_the_mean_as_often_as_they_promise(egos, runs, between, low):
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     hits = 0
     for _ in range(300):
         values = between * rng.normal(size=egos) + rng.normal(size=(runs, egos))
@@ -58,13 +59,13 @@ def test_scores_go_in_as_they_come_out():
 
 
 def test_few_egos_that_differ_give_a_wider_interval_than_pooled_runs():
-    values = np.array([1.0, 2.0, 3.0]) + 0.01 * np.random.default_rng(5).normal(size=(100, 3))
+    values = np.array([1.0, 2.0, 3.0]) + 0.01 * default_rng(5).normal(size=(100, 3))
     nested, pooled = mean_interval(values), mean_interval(values.ravel())
     assert nested.high - nested.low > 4 * (pooled.high - pooled.low)
 
 
 def test_seeds_agree_with_scipy_t_interval():
-    values = np.random.default_rng(7).normal(1.1, 0.1, (5, 40, 3))
+    values = default_rng(7).normal(1.1, 0.1, (5, 40, 3))
     found = over_seeds(values)
     means = values.mean(axis=(1, 2))
     expected = stats.ttest_1samp(means, 0.0).confidence_interval(0.95)
@@ -94,7 +95,7 @@ def test_what_cannot_be_averaged_is_named():
 @pytest.mark.parametrize("side", [1, -1])
 def test_alignment_is_scipys(side):
     """A turn and a shift, also where a reflection would fit better."""
-    rng = np.random.default_rng(8)
+    rng = default_rng(8)
     estimate = rng.normal(size=(50, 3)) * [9, 5, 1]
     truth = Rotation.from_rotvec([0.3, -0.2, 2.0]).apply(estimate * [1, 1, side])
     truth += rng.normal([40, -7, 3], 0.1, truth.shape)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import holed, measured, refused, textbook
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles.solo import filterpys
 from shell import ROOT, ran
@@ -68,7 +69,7 @@ def test_step_by_step_is_the_track(name, known, crossing):
 def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start, near):
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The
     star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
-    draw, stream = np.random.default_rng(0), start(interval=0.1)
+    draw, stream = default_rng(0), start(interval=0.1)
     stream.step(Z, U, 0.1)
     theirs, t, path = filterpys(Z, np.diag(FITTED.gnss_variance), 0.1), [0.0, 0.1], [0 * U, 0.1 * U]
     for k in range(200):
@@ -139,7 +140,7 @@ def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float)
 def test_a_late_fix_is_nearly_used_up():
     """0.3 s late at the noise of scenario 2 at 10 m/s: within 2 % of the least squares over the whole window, which
     is itself as good as it says; without the late fixes a filter is clearly worse."""
-    draw = np.random.default_rng(5)
+    draw = default_rng(5)
     errors = np.array([window(draw, 60, 3, q=0.1, r=3.5) for _ in range(150)])
     ours, best, without, _ = np.sqrt(np.mean(errors**2, axis=0))
     assert best == pytest.approx(errors[0, 3], rel=0.2)
@@ -171,7 +172,7 @@ def test_bad_input_is_named_and_forgotten(name, field, given):
 
 def test_the_motion_that_is_kept_is_its_integral():
     """Closed form: the summed motion, interpolated at any age, while the ring of steps wraps around and grows."""
-    rng, history = np.random.default_rng(0), MotionHistory(10.0)
+    rng, history = default_rng(0), MotionHistory(10.0)
     dt = np.concatenate([rng.uniform(0.2, 0.9, 100), rng.uniform(0.01, 0.05, 500), rng.uniform(0.2, 0.9, 50)])
     moved, variance = rng.normal(size=(len(dt), 3)), rng.uniform(size=(len(dt), 3))
     end, sums = np.append(0.0, np.cumsum(dt)), np.zeros((len(dt) + 1, 6))

@@ -15,6 +15,8 @@ import pandas as pd
 import pytest
 from conftest import refused, winding, without
 from filterpy.kalman import KalmanFilter
+from numpy.linalg import norm, solve
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from oracles.solo import filterpys
 
@@ -59,12 +61,12 @@ def links(recording):
     own = recording.links.of(EGO)
     there = set(zip(step[own].tolist(), of[own].tolist(), strict=True))
     held = [k for k in own if all((step[k] - a, of[k]) in there for a in range(ESTABLISHED + 1)) and step[k] < 68]
-    return np.random.default_rng(0).choice(held, RUNS)
+    return default_rng(0).choice(held, RUNS)
 
 
 def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
     """One wrong number in each run, of 1 to 1e6 m in a random direction; of an angle anything."""
-    rng, run = np.random.default_rng(1), np.arange(RUNS)
+    rng, run = default_rng(1), np.arange(RUNS)
     size, way = SIZES, rng.normal(size=(RUNS, 3))
     gnss, relative = recording.gnss.copy(), recording.relative.copy()
     step, sender = recording.links.step[links], recording.links.neighbour[links]
@@ -76,7 +78,7 @@ def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
         relative[run, links, 2] = rng.uniform(0.0, np.pi, RUNS)
     elif kind in ("fix", "message"):
         who = np.full(RUNS, EGO) if kind == "fix" else sender
-        gnss[run, step, who] += size[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+        gnss[run, step, who] += size[:, None] * way / norm(way, axis=1, keepdims=True)
     return replace(recording, gnss=gnss, relative=relative)
 
 
@@ -92,7 +94,7 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(name, 
     farthest = 0.0
     for kind in KINDS:
         x = method(damaged(recording, kind, links).of_runs(runs), [EGO]).x[:, :, 0]
-        moved = np.linalg.norm(x - clean, axis=-1)
+        moved = norm(x - clean, axis=-1)
         farthest = max(farthest, float(moved.max()))
         later: Floats = np.array([row[t + 10 :].max() for row, t in zip(moved, step, strict=True)])
         beyond = after if name in FURTHER else BEYOND
@@ -105,8 +107,8 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
     "odometer" and "velocity" are those of a message."""
     method, run, of = CooperativeFilter(), np.arange(RUNS), recording.links
     step, sender = of.step[links], of.neighbour[links]
-    way = np.random.default_rng(1).normal(size=(RUNS, 3))
-    error = SIZES[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    way = default_rng(1).normal(size=(RUNS, 3))
+    error = SIZES[:, None] * way / norm(way, axis=1, keepdims=True)
     velocity = recording.velocity.copy()
     if kind == "velocity":  # a recording takes none of more than 10 km/s
         velocity[run, step, sender] += 5e-3 * error
@@ -129,10 +131,10 @@ def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_d
     1.2 of it, but for the ego's very first fix."""
     own = recording.links.of(EGO)
     when = recording.links.step[own]
-    links = np.random.default_rng(2).choice(own[(when >= first) & (when < 68)], RUNS)
+    links = default_rng(2).choice(own[(when >= first) & (when < 68)], RUNS)
     links[::4] = links[::4] if first else own[when == 0][0]
     (x, _), (clean, std) = estimates(recording, kind, links), estimates(recording, "", links)
-    moved, step = np.linalg.norm(x - clean, axis=-1), recording.links.step[links]
+    moved, step = norm(x - clean, axis=-1), recording.links.step[links]
     scaled = moved / (1.0 if first else std)
     later: Floats = np.array([row[t + 10 :].max() for row, t in zip(scaled, step, strict=True)])
     most = {"fix": 8.0}.get(kind, 2.0), 1.2
@@ -147,7 +149,7 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
     """A vehicle of whose fixes 15 % are 3 m to 10 km off on each axis, its motion's variances, and filterpy's filter at
     the first fix."""
     drive = observe(winding(steps, 10.0, 7.0), S2, V2X(0), seed=2)
-    rng, gnss = np.random.default_rng(3), drive.gnss.copy()
+    rng, gnss = default_rng(3), drive.gnss.copy()
     wild = rng.random(steps) < 0.15
     wild[:5] = False
     gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
@@ -164,7 +166,7 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation():
     for t in range(1, 200):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
         innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
-        q = innovation @ np.linalg.solve(S, innovation)
+        q = innovation @ solve(S, innovation)
         gain, share = 1 - 3 * 12.25 / np.trace(S), max(q / limit, 1.0) if hits < gate.PATIENCE else 1.0
         hits = hits + gain if q > limit else max(hits - gate.LEAK * gain, 0.0)
         if share < gate.HARD_REJECT_FACTOR:

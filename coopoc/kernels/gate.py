@@ -19,17 +19,7 @@ cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 import math
 
 from .compiling.compile import inside
-from .compiling.small import (
-    add,
-    add_diagonal,
-    apply,
-    choose_each,
-    from_upper,
-    inner_product,
-    inverse,
-    scale,
-    subtract,
-)
+from .compiling.small import add, add_diagonal, apply, choose_each, from_upper, inner_product, inverse, scale, subtract
 from .compiling.vectors import Lanes, choose
 
 GATE, FIX_GATE = 9.0, 12.0

@@ -208,13 +208,7 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
 
 @compiled
 def correct_drives(
-    gnss: Floats,
-    velocity: Floats,
-    fresh: Floats,
-    variance: Floats,
-    columns: Ints,
-    dt: float,
-    out: Floats,
+    gnss: Floats, velocity: Floats, fresh: Floats, variance: Floats, columns: Ints, dt: float, out: Floats
 ) -> bool:
     """Whether the odometry of one of the columns fails; write what then corrects it.
 

@@ -48,12 +48,7 @@ class MotionHistory:
     def check(self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float) -> None:
         """InputError if a stream cannot take this step."""
         number(
-            "dt",
-            dt,
-            ROUNDING,
-            MAX_POSITION,
-            allowed="finite and > 1 ns",
-            hint="Give the seconds since the last step.",
+            "dt", dt, ROUNDING, MAX_POSITION, allowed="finite and > 1 ns", hint="Give the seconds since the last step."
         )
         three("velocity", velocity, MAX_SPEED)
         if np.isnan(fix_or_none(gnss)).all():

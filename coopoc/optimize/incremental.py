@@ -45,9 +45,7 @@ class Incremental:
         self._step(problem, range(len(self.names)), initial_guess(problem))
 
     def add(
-        self,
-        factors: Iterable[Factor | Sequence[Any]] = (),
-        values: Mapping[str, npt.ArrayLike] | None = None,
+        self, factors: Iterable[Factor | Sequence[Any]] = (), values: Mapping[str, npt.ArrayLike] | None = None
     ) -> None:
         """One step of iSAM2 with new measurements, and first guesses of the nodes that are new.
 

@@ -194,10 +194,7 @@ def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params 
 
 
 def plan(
-    study: Study | str,
-    out: str | Path = "runs",
-    settings: Params | None = None,
-    retry_failed: bool = False,
+    study: Study | str, out: str | Path = "runs", settings: Params | None = None, retry_failed: bool = False
 ) -> dict[str, Any]:
     """Number of cells that `run_study` would keep, repeat and compute, and the reasons of failures; nothing is written.
 
@@ -234,14 +231,7 @@ def _unfinished(cells: Sequence[Cell], folder: Path) -> tuple[list[Cell], list[t
     return new, failed
 
 
-def _work(
-    study: Study,
-    cells: Sequence[Cell],
-    folder: Path,
-    jobs: int,
-    progress: bool,
-    retry_failed: bool,
-) -> None:
+def _work(study: Study, cells: Sequence[Cell], folder: Path, jobs: int, progress: bool, retry_failed: bool) -> None:
     new, before = _unfinished(cells, folder)
     todo = [*new, *(cell for cell, _ in before if retry_failed)]
     if todo:
@@ -252,12 +242,7 @@ def _work(
     count = len(cells)
     with (
         progress_bar(
-            total=count,
-            initial=count - len(todo),
-            desc=study.name,
-            unit="cell",
-            smoothing=0.05,
-            disable=not progress,
+            total=count, initial=count - len(todo), desc=study.name, unit="cell", smoothing=0.05, disable=not progress
         ) as bar,
         closing(outcomes),
     ):

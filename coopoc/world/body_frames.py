@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import TINY, Floats
 from ..errors import InputError
 from .fleet import Fleet
 from .links import Links, wrap
@@ -91,6 +91,31 @@ def in_world(recording: Recording) -> Recording:
     relative[..., 1] = wrap(relative[..., 1] + body.heading[:, links.step, links.observer])
     velocity = turned(recording.velocity, np.nan_to_num(midway(body.heading)))
     return replace(recording, body=None, velocity=velocity, relative=relative)
+
+
+def between_origins(recording: Recording, position: Floats, heading: Floats) -> Recording:
+    """The recording with ranges between vehicles: |p_j - p_i| - |p_j + R(h_j) t_j - p_i - R(h_i) t_i| is added.
+
+    Args:
+        recording: with tags t.
+        position: p, (R, T, N, 3) m.
+        heading: h, (R, T, N) rad, NaN of what has no tag.
+
+    >>> from coopoc import Sensors, observe
+    >>> fleet = Fleet(("a", "b"), [0, 1], np.full((2, 2, 3), [[0.0] * 3, [9, 0, 0]]), np.zeros((2, 2, 3)))
+    >>> seen = replace(observe(fleet, Sensors()), tags=[[0, -1.0, 0], [0, 2, 0]])
+    >>> moved = between_origins(seen, fleet.position[None], np.full((1, 2, 2), np.pi / 2))
+    >>> (moved.relative - seen.relative)[0, 0].round(9).tolist()
+    [3.0, 0.0, 0.0]
+    """
+    links, relative = recording.links, recording.relative.copy()
+    tips = position + turned(recording.tags, np.nan_to_num(heading))
+    far, longer = (
+        np.linalg.norm(ends[:, links.step, links.neighbour] - ends[:, links.step, links.observer], axis=-1)
+        for ends in (position, tips)
+    )
+    relative[..., 0] = np.maximum(relative[..., 0] + far - longer, TINY)
+    return replace(recording, relative=relative, tags=())
 
 
 def body_measurements(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> tuple[Floats, Body]:

@@ -7,20 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import (
-    TINY,
-    Bools,
-    Floats,
-    Ints,
-    checked,
-    instance,
-    last_true,
-    number,
-    plain,
-    refuse,
-    remade,
-    texts,
-)
+from ..arrays import TINY, Bools, Floats, Ints, checked, instance, last_true, number, plain, refuse, remade, texts
 from ..errors import InputError
 from ..text import short_repr
 from .fleet import check_steps, clock, columns, interval, names
@@ -72,6 +59,8 @@ COMPARED_SECONDS, LONG_STDS, APART_SHARE, CONTRADICTING_SHARE = 10.0, 6.0, 0.4, 
 """s between the fixes whose distance is compared with the odometry's; standard deviations of a fix, stated and as they
 scatter, that the longer of the two must have (the shorter one: one); share of both lengths by which they contradict
 each other; share of such pairs, of all."""
+MAX_TAG = 100.0
+"""m, from a vehicle's position to its antenna."""
 NOTHING_SIMULATED = "nothing is simulated"
 """Words in the notes of a recording that holds measurements as they were logged."""
 
@@ -99,6 +88,8 @@ class Recording:
         fix_factor: (T, N) by which the deviation of each fix is larger than `sensors` says; none: all are 1.
         motion_variance: (T, N) m^2/s by which each motion is less certain than `sensors` says, as of a vehicle without
             odometry beside others; none: all are 0.
+        tags: (N, 3) m forward, left and up from the position of each vehicle to its antenna, between which ranges are;
+            none: all are 0, as those of landmarks must be. Pose filters take them off.
 
     Raises:
         InputError: arrays of other shapes or kinds, links of steps or columns that are not there, more of them than
@@ -121,6 +112,7 @@ class Recording:
     landmarks: tuple[int, ...] = ()
     fix_factor: Floats = ()  # type: ignore[assignment]
     motion_variance: Floats = ()  # type: ignore[assignment]
+    tags: Floats = ()  # type: ignore[assignment]
 
     __reduce__ = remade
 
@@ -157,6 +149,9 @@ class Recording:
             wrong, allowed = ~((values >= least) & (values < np.inf)), f"must be {'>' * stated or '>='} 0 and finite"
             refuse(name, values, wrong, allowed, f"{stated} means as `sensors` states.")
             self.__dict__[name] = values
+        tags = self.tags if plain(self.tags).size else np.zeros((len(ids), 3))
+        self.__dict__["tags"] = tags = checked("tags", tags, "(N, 3)", (len(ids), 3))
+        plausible("tags", tags, MAX_TAG)
         self.sensors.check_assumed()
         self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))
 
@@ -400,6 +395,11 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
         for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std")
         if (std := getattr(sensors, name)) > DEGREES_STD
     ]
+    if recording.body is None and recording.tags.any():
+        sentences.append(
+            f"ranges between tags up to {np.abs(recording.tags).max():.2g} m from their vehicles are those between "
+            'vehicles, as methods of positions take them; a PoseFilter (frame="body") takes off the tags'
+        )
     if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
         sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS_NOTE}")
     return tuple(UNLIKELY + text for text in sentences)

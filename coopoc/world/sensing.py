@@ -114,11 +114,7 @@ def observe(
 
 
 def find_links(
-    fleet: Fleet,
-    observers: Sequence[int],
-    v2x: V2X,
-    min_range: float,
-    landmarks: Sequence[int] = (),
+    fleet: Fleet, observers: Sequence[int], v2x: V2X, min_range: float, landmarks: Sequence[int] = ()
 ) -> Links:
     """Links of each observer to its K nearest vehicles in [min_range, radius], by step, observer, distance.
 

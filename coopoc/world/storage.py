@@ -31,6 +31,7 @@ ARRAYS = (
     "landmarks",
     "fix_factor",
     "motion_variance",
+    "tags",
 )
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.linalg import norm
 
 from coopoc import InputError, Sensors
 from coopoc.arrays import Bools, Floats, Ints, checked, last_true
@@ -294,7 +295,7 @@ def _in_world(
         summary.refuse("speeds where a world velocity is given", speeds)
         moved = step_means(Signal(world.t, np.nan_to_num(world.value)), steps.grid)
         return moved, world, heading._replace(wanders=0.0, of_pace=np.zeros_like)
-    if len(speed.t) and (heading.at is not unknown or np.linalg.norm(speed.value.mean(axis=0)) < STANDS):
+    if len(speed.t) and (heading.at is not unknown or norm(speed.value.mean(axis=0)) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
@@ -302,7 +303,7 @@ def _in_world(
         def moving(at: Floats) -> Floats:
             """(G, 3) m/s, NaN where something moves, and no heading is known."""
             own, angle = between(speed, at), heading.at(at)
-            stands = np.isnan(angle) & ((np.linalg.norm(own, axis=1) < STANDS) | (heading.at is unknown))
+            stands = np.isnan(angle) & ((norm(own, axis=1) < STANDS) | (heading.at is unknown))
             return np.where(stands[:, None], 0.0, turned(own, angle))
 
         velocity = moving(at)
@@ -351,7 +352,7 @@ def _heading(
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
             if len(way.speed.t):
                 course = wrap(course - np.arctan2(*between(way.speed, t)[:, 1::-1].T))
-            bends = np.linalg.norm(wrap(np.diff(course))) / (np.linalg.norm(pace[moving][1:] * np.diff(t)) + MOVING)
+            bends = norm(wrap(np.diff(course))) / (norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
             shown_at = t[: len(t) * (rate is None)]
             return Course(courses, source, wanders, np.zeros_like, float(np.median(std)), shown_at, float(bends))
@@ -362,7 +363,7 @@ def _wander(heading: Course, moves: Floats, steps: Steps) -> Floats:
     """(T,) m^2/s, by which a position becomes uncertain: `heading.wanders`, that of its pace, and where a course is
     held for longer than fixes are apart, by d/dt of (k s^2 / 2)^2, with the bends k of the way s since then, of s^2 at
     most."""
-    pace = np.linalg.norm(np.nan_to_num(moves), axis=1)
+    pace = norm(np.nan_to_num(moves), axis=1)
     more: Floats = heading.of_pace(steps.grid) * pace ** (4 / 3)
     if heading.wanders > 0.0 and len(heading.shown) > 1:
         way = np.cumsum(pace) * steps.dt
@@ -383,23 +384,23 @@ def _longest(there: Bools, grid: Floats) -> str:
 def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     """Velocity by fixes, by a Kalman filter (`kernels.constant_velocity`). It is known by
     four of them at the latest, or as well as by two that are as far apart as nine in ten."""
-    fixes, variance = way.fixes, way.std**2
-    if len(fixes.t) < 2:
-        none = np.zeros(len(fixes.t))
-        return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), none > 0, 0.0, none)
-    apart = np.diff(fixes.t)
+    (t, x), variance = way.fixes, way.std**2
+    if len(t) < 2:
+        none = np.zeros(len(t))
+        return Shown(Signal(t, np.zeros_like(x)), none > 0, 0.0, none)
+    apart = np.diff(t)
     interval, longest = float(np.median(apart)), np.quantile(apart, 0.9)
     velocity, growth, spread, proved = constant_velocity(
-        fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
+        t, x, interval, steps.gap(t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
     )
     sure = np.isfinite(growth)
     since = np.arange(len(growth)) - last_true(~sure)
     begun = since > 1  # two fixes show no change
-    learned = begun & (fixes.t > fixes.t[0] + REMEMBERS)
+    learned = begun & (t > t[0] + REMEMBERS)
     grown = (growth * np.maximum(proved, variance))[learned if learned.any() else begun]
     wanders = float(grown.mean() / interval) if len(grown) else 0.0
     certain = (since > 3) | (sure & (spread * longest**2 < 2.0))
-    return Shown(Signal(fixes.t, velocity), certain, wanders, np.sqrt(proved * spread))
+    return Shown(Signal(t, velocity), certain, wanders, np.sqrt(proved * spread))
 
 
 def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:
@@ -431,10 +432,10 @@ def _present(signals: Sequence[Signal], steps: Steps) -> Bools:
 def _held(fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bools, std: float) -> Bools:
     """(M,) fixes that are as the one before (`again`), though what moves has gone on by their standard deviation."""
     nearest, _ = steps.nearest(fixes.t)
-    moves = there & (np.linalg.norm(velocity, axis=1) > STANDS)
+    moves = there & (norm(velocity, axis=1) > STANDS)
     way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
     before = last_true(~again)
-    return np.asarray(again & there[nearest] & (np.linalg.norm(way - way[before], axis=1) > std))
+    return np.asarray(again & there[nearest] & (norm(way - way[before], axis=1) > std))
 
 
 def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps) -> Floats:

@@ -128,6 +128,7 @@ def read_log(
     stamps: Stamps = "header",
     clock: Mapping[str, float] | None = None,
     antenna: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
+    tag: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
     origin: Origin | None = None,
     truth: str | Path | None = None,
     sensors: Sensors | None = None,
@@ -159,6 +160,8 @@ def read_log(
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
         antenna: m forward, left, up from the reference point of all that move to their antennas, or vehicle -> these,
             as {"car1": (1.2, 0.3, 0.0)}: fixes become those of the reference points (`motion.member`).
+        tag: the same of antennas between which ranges are, which pose filters take off (`Recording.tags`); what stands
+            has none.
         origin: latitude deg, longitude deg, height m of the local frame; None: the first fix.
         truth: file of the truth, if it is not in the folder under that name; topic in a bag.
         sensors: noise that methods may assume; None: the standard deviations in the log, else `Sensors()`.
@@ -240,10 +243,14 @@ def read_log(
     rows = rows[~few]
     grid = _grid(rows, dt, body, summary)
     steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary, offset)
-    arms = antenna if isinstance(antenna, Mapping) else dict.fromkeys(ids, antenna)
-    columns_of("antenna", [*named("antenna", arms, "Give antenna={name: (forward, left, up)}.")], ids)
+    arms, tags = (each if isinstance(each, Mapping) else dict.fromkeys(ids, each) for each in (antenna, tag))
+    for option, each in (("antenna", arms), ("tag", tags)):
+        columns_of(option, [*named(option, each, f"Give {option}={{name: (forward, left, up)}}.")], ids)
     members = {name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name)) for name in ids}
-    recording = _recording(rows, members, steps, mutual and not body, sensors)
+    if tag is not None:
+        summary.assume("ranges are between tags, which only pose filters (frame=body) take off")
+    at = [np.zeros(3) if part.stands or tags.get(name) is None else tags[name] for name, part in members.items()]
+    recording = replace(_recording(rows, members, steps, mutual and not body, sensors), tags=np.array(at))
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     fleet = None
     if len(true_rows):

@@ -11,7 +11,7 @@ import scipy  # its statistics take half a second, and are imported where they a
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
-from coopoc.world.body_frames import in_world
+from coopoc.world.body_frames import between_origins, in_world
 from coopoc.world.links import spherical, stretches, wrap
 
 from .read import Log
@@ -188,6 +188,7 @@ def filtered(log: Log) -> Check:
     world, noise = rec, rec.sensors
     if rec.body is not None:
         world = in_world(replace(rec, body=replace(rec.body, heading=heading[None])))
+        world = between_origins(world, x[None], heading[None])
     gap, residual = residual_of(world, x, log.summary.reversed_pairs)
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
     flat, distance = distances(gap)

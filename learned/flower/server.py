@@ -110,12 +110,7 @@ def configured(grid: "Grid", context: "Context") -> None:
 
 
 def rounds(
-    grid: "Grid",
-    job: Job,
-    nodes: int,
-    timeout: float,
-    keep: Callable[[Row], object],
-    names: dict[int, str],
+    grid: "Grid", job: Job, nodes: int, timeout: float, keep: Callable[[Row], object], names: dict[int, str]
 ) -> None:
     """The rounds of a federation over a grid, by the Flower strategy of the recipe's rule.
 

@@ -54,13 +54,7 @@ class GainNet(Recurrent):
     19938
     """
 
-    def __init__(
-        self,
-        in_mult: int = 40,
-        out_mult: int = 5,
-        start_gain: float = 0.1,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, in_mult: int = 40, out_mult: int = 5, start_gain: float = 0.1, seed: int = 0) -> None:
         super().__init__()
         self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
         start_gain = number("start_gain", start_gain, -np.inf)

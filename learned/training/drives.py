@@ -118,11 +118,7 @@ Cut = tuple[int, int]
 
 
 def measured_clients(
-    drives: MeasuredDrives,
-    *,
-    start: Start = "gnss",
-    piece: int = 100,
-    split: float = 0.8,
+    drives: MeasuredDrives, *, start: Start = "gnss", piece: int = 100, split: float = 0.8
 ) -> tuple[Client, ...]:
     """Every vehicle of measured drives as a client: its own fixes and odometry in pieces, `split` of them for training.
 

@@ -186,10 +186,7 @@ def pooled(parts: Sequence[Segments]) -> tuple[Segments, list[Ints]]:
 
 @one_core()
 def fit_okf(
-    training: Segments,
-    validation: Segments,
-    steps: int = 300,
-    progress: str | None = None,
+    training: Segments, validation: Segments, steps: int = 300, progress: str | None = None
 ) -> tuple[NoiseParameters, dict[str, Any]]:
     """Train noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
 

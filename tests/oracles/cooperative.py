@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.linalg import norm, solve
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
@@ -123,11 +124,11 @@ class Belief:
     def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, share: float = 1.0) -> float:
         """Several numbers with one gate, or a share of their information; their squared Mahalanobis distance."""
         gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
-        q = float(gap @ np.linalg.solve(s, gap))
+        q = float(gap @ solve(s, gap))
         if gate and q > gate:
             s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
         s = s / share
-        gain = np.linalg.solve(s, h @ self.p).T
+        gain = solve(s, h @ self.p).T
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
 
@@ -138,8 +139,8 @@ class Belief:
             return
         p, m = self.p[np.ix_(some, some)], self.x[some]
         prior = np.broadcast_to(prior, len(which))[[i in some for i in which]]
-        odds += 0.5 * (np.log(prior).sum() - np.linalg.slogdet(p)[1] - m @ np.linalg.solve(p, m))
-        none, k = 1 / (1 + exp(min(-odds, 700))), np.linalg.solve(p, self.p[some]).T
+        odds += 0.5 * (np.log(prior).sum() - np.linalg.slogdet(p)[1] - m @ solve(p, m))
+        none, k = 1 / (1 + exp(min(-odds, 700))), solve(p, self.p[some]).T
         self.x, self.p = self.x - none * k @ m, self.p - none * k @ (p - (1 - none) * np.outer(m, m)) @ k.T
 
 
@@ -373,7 +374,7 @@ class Oracle:
     def pace(self, t):
         """The most of late speeds, and its direction."""
         dt, u = self.dt, self.u[t]
-        speed, late = float(np.linalg.norm(u)), self.state.speed * exp(-dt / SPEED_MEMORY_S)
+        speed, late = float(norm(u)), self.state.speed * exp(-dt / SPEED_MEMORY_S)
         self.state.blind += dt
         if speed > 0.5 * late:
             self.state.course, self.state.blind = u / speed, 0.0
@@ -557,7 +558,7 @@ class Oracle:
         """Where ego and members are now, and the members, nearest first."""
         s, b = self.state, self.state.belief
         at = {j: b.x[b.at("x", j)] + s.way.get(j, 0.0) for j in (self.ego, *s.members)}
-        return at, sorted(s.members, key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
+        return at, sorted(s.members, key=lambda j: float(norm(at[j] - at[self.ego])))
 
     def dismiss(self, j, measured: bool, doubted: bool):
         if measured and (doubted or j not in self.state.trusted):
@@ -572,8 +573,8 @@ class Oracle:
         if self.ego not in s.vague:
             self.learn_fix(3, rows)
             _, gap, _, r = self.mahalanobis(s.belief, rows)
-            far, most = float(np.linalg.norm(gap)), s.speed * s.unseen + 2 * sqrt(r.sum())
-            more = far - float(np.linalg.norm(s.gap))
+            far, most = float(norm(gap)), s.speed * s.unseen + 2 * sqrt(r.sum())
+            more = far - float(norm(s.gap))
             if more > most or far < 2 * sqrt(r.sum()):
                 s.jumped = more > most
             s.shown, s.gap, s.unseen = max(s.shown + min(more, most), 0.0), gap, 0.0
@@ -631,7 +632,7 @@ class Oracle:
         h = np.array([b.row(row[0], c) for c, row in enumerate(rows)])
         gap, r = np.array([row[1] for row in rows]) - h @ b.x, np.array([row[2] for row in rows])
         cov = h @ b.p @ h.T
-        return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
+        return float(gap @ solve(cov + np.diag(r), gap)), gap, cov, r
 
     def may_slip(self, fix: Floats, way2: float) -> float:
         return min(SLIP_M2, max(float(np.mean(fix)), 0.25 * way2))
@@ -670,7 +671,7 @@ class Oracle:
                 b.updates(h, z, r)
             return 0.0 if supported else 1.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
-        square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
+        square = float(gap @ solve(own + np.diag(r), gap))
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
         mine, noise, locked = np.trace(own), r.sum(), s.locked
         if not judged:
@@ -713,7 +714,7 @@ class Oracle:
         mean = mean + (gap * min(1.0, sqrt(CLIP / q)) - mean) / count
         s.mean[j] = count, mean, noise + (r.sum() - noise) / count
         v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
-        near = mean @ np.linalg.solve(v, mean)
+        near = mean @ solve(v, mean)
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
         v = v + (self.usual(j) if j != self.ego else 0.0) * np.eye(3)
         odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
@@ -757,7 +758,7 @@ class Oracle:
             two, cross = float(k is not None), b.p[at, to]
             v = b.p[at, at] + two * (b.p[to, to] - cross - cross.T) + 1e-6 * np.eye(3)
             gap = b.x[at] - two * b.x[to]
-            return float(gap @ np.linalg.solve(v, gap))
+            return float(gap @ solve(v, gap))
 
         alike = {j: [k for k in heard if k == j or far(j, k) < FIX_GATE] for j in heard}
         doubtless = [j for j in heard if far(j) > WILD]
@@ -849,7 +850,7 @@ class Oracle:
                 r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
                 r += self.life.own + self.life.common
             gap = message.mean + (t - message.step) * self.dt * message.velocity - place
-            q = (np.linalg.norm(gap) - relative[0]) ** 2 / r
+            q = (norm(gap) - relative[0]) ** 2 / r
             if np.isfinite(relative).all():
                 q = np.square(gap - to_vector(relative)).sum() / (r + std[1] ** 2 * gap @ gap)
             found.append(min(float(q), FIX_GATE))
@@ -1127,4 +1128,4 @@ class Oracle:
 
 def normal(x: Floats, cov: Floats) -> float:
     """Logarithm of the density of N(0, cov)."""
-    return float(-0.5 * (np.linalg.slogdet(2 * pi * cov)[1] + x @ np.linalg.solve(cov, x)))
+    return float(-0.5 * (np.linalg.slogdet(2 * pi * cov)[1] + x @ solve(cov, x)))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.linalg import inv, solve
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
@@ -58,7 +59,7 @@ def placed(member: Member, information: Floats) -> bool:
 def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats]:
     """Fixes and converted vectors at the predicted geometry; then one exact step."""
     n = len(star)
-    information, eta = np.linalg.inv(p), np.zeros(3 * n)
+    information, eta = inv(p), np.zeros(3 * n)
     for k, member in enumerate(star):
         if member.new:
             at = slice(3 * k, 3 * k + 3)
@@ -69,15 +70,15 @@ def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel, ex
     for k in used:
         h, r, z = converted(star[k].relative, x[k] - x[0], noise_model)
         add(linear, linear_eta, k, h.T @ r @ h, h.T @ r @ z)
-    move = np.linalg.solve(linear, linear_eta)
+    move = solve(linear, linear_eta)
     if not exact:
-        return x + move.reshape(-1, 3), np.linalg.inv(linear)
+        return x + move.reshape(-1, 3), inv(linear)
     at = x + move.reshape(-1, 3)
     for k in used:
         jacobian, residual = whitened(star[k].relative, at[k] - at[0], noise_model)
         ahead = move[3 * k : 3 * k + 3] - move[:3]
         add(information, eta, k, jacobian.T @ jacobian, jacobian.T @ (residual + jacobian @ ahead))
-    p = np.linalg.inv(information)
+    p = inv(information)
     return x + (p @ eta).reshape(-1, 3), p
 
 

@@ -1,6 +1,7 @@
 """MSMV-R, one run: P^-1 = P_prior^-1 + C_p^-1 + sum_j C_j^-1, each neighbour a pseudo-fix y_j = p_j - rho(r_ij)."""
 
 import numpy as np
+from numpy.linalg import inv, solve
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
@@ -26,9 +27,9 @@ def follow(stars: list[list[Member]], noise_model: NoiseModel) -> tuple[Floats, 
                     else noise_model.relative_cov(member.relative) + np.diag(member.variance)
                 )
                 sources.append((member.position - to_vector(member.relative), cov))
-        information = np.linalg.inv(p) + sum((np.linalg.inv(c) for _, c in sources), np.zeros((3, 3)))
-        eta = sum((np.linalg.solve(c, y - x) for y, c in sources), np.zeros(3))
-        p = np.linalg.inv(information)
+        information = inv(p) + sum((inv(c) for _, c in sources), np.zeros((3, 3)))
+        eta = sum((solve(c, y - x) for y, c in sources), np.zeros(3))
+        p = inv(information)
         x = x + p @ eta
         estimates.append((x, p))
     return np.array([x for x, _ in estimates]), np.array([p for _, p in estimates])

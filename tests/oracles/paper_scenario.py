@@ -7,6 +7,7 @@ with unit covariances, and by the joint filter of its star with the acting noise
 from typing import Any
 
 import numpy as np
+from numpy.linalg import inv, solve
 
 Array = Any
 FIX, RATIO, RANGE, ANGLE, FLOOR, DT = 3.5, 0.15, 1.0, np.deg2rad(4.0), 0.05, 0.1
@@ -53,7 +54,7 @@ def joint(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int
     for k in new:
         x[k] = fixes[k] if k == 0 or relative[k] is None else x[0] + cartesian(relative[k])
     prior, at = x.ravel().copy(), x.ravel().copy()
-    weight = np.linalg.inv(p)
+    weight = inv(p)
     for _ in range(4):
         h, r = weight + np.eye(len(at)) / FIX**2, weight @ (prior - at) + (fixes.ravel() - at) / FIX**2
         for k, m in enumerate(relative):
@@ -66,8 +67,8 @@ def joint(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int
                 j[:, :3], j[:, 3 * k : 3 * k + 3] = -slope, slope
                 w = np.diag([RANGE**-2, ANGLE**-2, ANGLE**-2])
                 h, r = h + j.T @ w @ j, r + j.T @ w @ gap
-        at = at + np.linalg.solve(h, r)
-    return at.reshape(-1, 3), np.linalg.inv(h)
+        at = at + solve(h, r)
+    return at.reshape(-1, 3), inv(h)
 
 
 def laplacian(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int]) -> tuple[Array, Array]:
@@ -81,7 +82,7 @@ def laplacian(x: Array, p: Array, fixes: Array, relative: list[Array], new: list
         lap[[0, k], [k, 0]] -= 1.0
         delta[0], delta[k] = delta[0] - v, delta[k] + v
     h = np.kron(np.vstack([lap, np.eye(n)]), np.eye(3))
-    p = np.linalg.inv(np.linalg.inv(p) + h.T @ h)
+    p = inv(inv(p) + h.T @ h)
     z = np.vstack([delta, fixes]).ravel()
     return (x.ravel() + p @ h.T @ (z - h @ x.ravel())).reshape(-1, 3), p
 

@@ -24,10 +24,17 @@ def motion(state, inputs, dt):  # type: ignore[no-untyped-def]
     return np.concatenate([state[:3] + dt * u, [state[3] + turn], state[4:]])
 
 
-def spherical(own, other):  # type: ignore[no-untyped-def]
-    """Range, bearing from the heading, inclination."""
+def end_of(pose, tag):  # type: ignore[no-untyped-def]
+    """Where a tag is; what is no member has none."""
+    turned = np.exp(1j * [*pose, 0.0][3]) * complex(*tag[:2])
+    return np.add(pose[:3], [turned.real, turned.imag, tag[2]])
+
+
+def spherical(own, other, tags=np.zeros((2, 3))):  # type: ignore[no-untyped-def]
+    """Range between tags, bearing from the heading, inclination."""
     x, y, z = other[:3] - own[:3]
-    return np.array([np.sqrt(x * x + y * y + z * z), np.arctan2(y, x) - own[3], np.arctan2(np.hypot(x, y), z)])
+    far = np.linalg.norm(end_of(other, tags[1]) - end_of(own, tags[0]))
+    return np.array([far, np.arctan2(y, x) - own[3], np.arctan2(np.hypot(x, y), z)])
 
 
 def wrapped(residual, angle):  # type: ignore[no-untyped-def]
@@ -109,7 +116,7 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
     run, links, d = where
 
     def ends(s, k):  # type: ignore[no-untyped-def]
-        other = drive.landmark[k] if drive.ends[k, 1] < 0 else s[d * drive.ends[k, 1] :][:3]
+        other = drive.landmark[k] if drive.ends[k, 1] < 0 else s[d * drive.ends[k, 1] :][:4]
         return s[d * drive.ends[k, 0] :][:d], other
 
     def h(s):  # type: ignore[no-untyped-def]
@@ -118,13 +125,14 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
             mine, other = ends(s, k)
             pair = s[d * drive.own.shape[2] + drive.ends[k, 2]]
             longer = np.array([mine[6] + pair, 0, 0]) if d > 6 else 0
-            predicted.append((spherical(mine, other) + longer)[np.isfinite(drive.relative[run, k])])
+            every = spherical(mine, other, drive.tags[drive.ends[k, :2]]) + longer
+            predicted.append(every[np.isfinite(drive.relative[run, k])])
         return np.concatenate(predicted)
 
     def variance(s):  # type: ignore[no-untyped-def]
         more = [[0.0] * len(kind)]
         for k in links if passes > 1 else ():
-            gap = lambda s, k=k: ends(s, k)[1] - ends(s, k)[0][:3]  # noqa: E731
+            gap = lambda s, k=k: ends(s, k)[1][:3] - ends(s, k)[0][:3]  # noqa: E731
             to = jacobian(gap, s)
             more.append(curvature(gap(s), to @ P @ to.T)[np.isfinite(drive.relative[run, k])])
         return np.array(noise.relative)[kind] + np.concatenate(more[passes > 1 :])

@@ -8,12 +8,13 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from ..odometry_fault import SIZE, judge
-from .odometry import PoseNoise, join, predict, symmetrise
+from .odometry import join, predict, symmetrise
 from .scalar_update import (
     ALONE,
     COST,
     USED,
     ZERO,
+    PoseNoise,
     Poses,
     apply_pending_rows,
     update_fix,
@@ -42,6 +43,7 @@ class PoseMeasurements(NamedTuple):
         landmark: (L, 3) m, its position.
         relative: (R, L, 3) m, rad from the observer's heading, rad; NaN where missing.
         dt: s.
+        tags: (n + 1, 3) m forward, left, up, between which ranges are; the last, 0, of landmarks.
     """
 
     own: Floats
@@ -51,20 +53,7 @@ class PoseMeasurements(NamedTuple):
     landmark: Floats
     relative: Floats
     dt: float
-
-
-class PoseOptions(NamedTuple):
-    """How members are filtered.
-
-    Attributes:
-        d: numbers of a member, 4, 6, 7 or 10.
-        passes: of the relative measurements, each linear at the state that the last one found.
-        fusion: JOINT, NAIVE or INTERSECTION.
-    """
-
-    d: int
-    passes: int
-    fusion: int
+    tags: Floats
 
 
 @compiled
@@ -73,7 +62,6 @@ def run_filter(
     noise: PoseNoise,
     begin: Floats,
     spread: Floats,
-    options: PoseOptions,
     poses: Poses,
     pair: Poses,
     faults: Floats,
@@ -86,17 +74,16 @@ def run_filter(
         begin: (R, S, n, 4) m and rad, poses at the first step, and where a member begins for the s-th time after that;
             NaN for its fix and compass there.
         spread: (4,) standard deviations of these.
-        options: of the filter.
         poses: memory for the members.
         pair: memory for two members.
         faults: of `new_faults`.
     """
-    (runs, steps, members, _), d = measured.own.shape, options.d
+    (runs, steps, members, _), d = measured.own.shape, noise.d
     x, cov = np.full((runs, steps, members, d), np.nan), np.full((runs, steps, members, d, d), np.nan)
     cost = np.zeros((runs, 2))
     for run in range(runs):
         for t in range(steps):
-            step(measured, noise, begin, spread, options, poses, pair, faults, run, t)
+            step(measured, noise, begin, spread, poses, pair, faults, run, t)
             for k in range(members):
                 if measured.active[t, k]:
                     own = slice(d * k, d * k + d)
@@ -111,7 +98,6 @@ def step(
     noise: PoseNoise,
     begin: Floats,
     spread: Floats,
-    options: PoseOptions,
     poses: Poses,
     pair: Poses,
     faults: Floats,
@@ -119,7 +105,7 @@ def step(
     t: int,
 ) -> None:
     """One step of all members: prediction, then each one's fix and compass, then the relative measurements."""
-    d = options.d
+    d = noise.d
     if t == 0:
         poses.totals[COST] = poses.totals[USED] = 0.0
         poses.x[:], poses.cov[:] = 0.0, 0.0
@@ -154,29 +140,27 @@ def step(
     apply_pending_rows(poses)
     if measured.first[t] == measured.first[t + 1]:
         return
-    if options.fusion == JOINT:
-        update_jointly(measured, noise, options, poses, run, t)
+    if noise.fusion == JOINT:
+        update_jointly(measured, noise, poses, run, t)
     else:
         for k in range(measured.first[t], measured.first[t + 1]):
-            fuse_pair(measured, noise, options, poses, pair, run, k)
+            fuse_pair(measured, noise, poses, pair, run, k)
 
 
 @compiled
-def update_jointly(
-    measured: PoseMeasurements, noise: PoseNoise, options: PoseOptions, poses: Poses, run: int, t: int
-) -> None:
+def update_jointly(measured: PoseMeasurements, noise: PoseNoise, poses: Poses, run: int, t: int) -> None:
     """All relative measurements of a step, pass after pass: the first linear at the state after the fixes, each of the
     others at what the last one found, from the same prior."""
-    d, begin, end = options.d, measured.first[t], measured.first[t + 1]
+    d, begin, end = noise.d, measured.first[t], measured.first[t + 1]
     left_out = np.zeros(end - begin, np.int64)
     for k in range(begin, end):
         i, j = d * measured.ends[k, 0], d * measured.ends[k, 1]
         if max(poses.cov[i, i], poses.cov[j, j] if j >= 0 else 0.0) > 0.5 * noise.flat:
             left_out[k - begin] = UNPLACED
-    if options.passes > 1:
+    if noise.passes > 1:
         poses.prior_x[:], poses.prior_cov[:] = poses.x, poses.cov
     cost = poses.totals[COST]  # of a pass: that of the last one is Laplace's approximation of the likelihood
-    for again in range(options.passes):
+    for again in range(noise.passes):
         poses.linear[:] = poses.x
         if again:
             poses.x[:], poses.cov[:], poses.totals[COST] = poses.prior_x, poses.prior_cov, cost
@@ -184,15 +168,13 @@ def update_jointly(
             i, j, pair = measured.ends[k]
             ends = (d * i, d * j, d * measured.own.shape[2] + pair)
             landmark, relative, bits = measured.landmark[k], measured.relative[run, k], left_out[k - begin]
-            bits = update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, bits)
-            left_out[k - begin] = bits
+            tags = measured.tags[i], measured.tags[j]
+            left_out[k - begin] = update_relative(poses, ends, landmark, relative, noise, bits, tags)
         apply_pending_rows(poses)
 
 
 @part
-def fuse_pair(
-    measured: PoseMeasurements, noise: PoseNoise, options: PoseOptions, poses: Poses, pair: Poses, run: int, k: int
-) -> None:
+def fuse_pair(measured: PoseMeasurements, noise: PoseNoise, poses: Poses, pair: Poses, run: int, k: int) -> None:
     """Update the observer of a relative measurement with the estimate of the member that it measured.
 
     Their joint covariance is taken as block diagonal, each block over its weight: 1 and 1 if the errors were
@@ -203,8 +185,7 @@ def fuse_pair(
 
     Args:
         measured: by the members.
-        noise: that is assumed.
-        options: its fusion not JOINT.
+        noise: that is assumed, its fusion not JOINT.
         poses: the state; covariances between members are zero.
         pair: memory.
         run: of the measurement.
@@ -214,9 +195,10 @@ def fuse_pair(
         Carrillo-Arce et al., Decentralized multi-robot cooperative localization using covariance intersection,
         IROS 2013.
     """
-    d, observer, other = options.d, options.d * measured.ends[k, 0], options.d * measured.ends[k, 1]
+    d, observer, other = noise.d, noise.d * measured.ends[k, 0], noise.d * measured.ends[k, 1]
     ends = (ZERO, d if other >= 0 else ALONE, 2 * d)
-    tries = WEIGHTS_TRIED if options.fusion == INTERSECTION and other >= 0 else 0
+    tags = measured.tags[measured.ends[k, 0]], measured.tags[measured.ends[k, 1]]
+    tries = WEIGHTS_TRIED if noise.fusion == INTERSECTION and other >= 0 else 0
     best, chosen = math.inf, 1.0
     for attempt in range(tries + 1):
         weight = chosen if attempt == tries else (attempt + 1.0) / WEIGHTS_TRIED
@@ -227,7 +209,7 @@ def fuse_pair(
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
         landmark, relative = measured.landmark[k], measured.relative[run, k]
-        update_relative(pair, ends, landmark, relative, noise.relative, noise.gate, noise.longer, ZERO)
+        update_relative(pair, ends, landmark, relative, noise, ZERO, tags)
         apply_pending_rows(pair)
         total = 0.0
         for i in range(d):

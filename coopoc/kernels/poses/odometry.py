@@ -1,48 +1,18 @@
 """Prediction of poses: odometry of speed and yaw rate moves a member's state and its covariance."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import part
 from ..gate import INITIAL_LOCKOUT
-from ..motion import MotionNoise, keep_pace, process_variance
+from ..motion import keep_pace, process_variance
 from ..odometry_fault import PACES, correct, new_state
-from .scalar_update import HEADING, OFFSET, SLOW, Poses, Three
+from .scalar_update import HEADING, OFFSET, SLOW, PoseNoise, Poses, Three
 
 UNKNOWN_HEADING_RAD2 = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
-
-
-class PoseNoise(NamedTuple):
-    """What a pose filter assumes.
-
-    Attributes:
-        fix: three variances, m^2.
-        heading: rad^2, of a compass.
-        relative: three variances, m^2, rad^2, rad^2.
-        odometer: of a velocity, as of the motion of 1 s.
-        yaw_rate: rad^2/s^2.
-        lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, of the offset of ranges, m^2, and of
-            the slow error of a velocity on three axes, m^2/s^2.
-        longer: 1 where that offset is a state, else 0.
-        keep: share of these but the offset that is left after a step.
-        flat: m^2, prior of a member that joins.
-        gate: squared normalised innovation beyond which a measurement weighs less.
-    """
-
-    fix: Three
-    heading: float
-    relative: Three
-    odometer: MotionNoise
-    yaw_rate: float
-    lasting: tuple[float, float, float, float, float, float]
-    longer: float
-    keep: float
-    flat: float
-    gate: float
 
 
 def new_faults(members: int, noise: PoseNoise, dt: float) -> Floats:

@@ -3,8 +3,8 @@
 The state of a member is d = 4, 6, 7 or 10 numbers: position m, heading rad and, of six, the odometer's scale error and
 the yaw rate's bias rad/s, of seven also what its ranges are too long by, m, of ten also the slow error of its velocity,
 m/s. Behind all members stand 0 and what the ranges of pairs are too long by beside that, m. A row is linear in the pose
-of one member and those offsets, (a, b, c, h, o), and at most in the position of another, (-a, -b, -c): every
-measurement here is one of the vector between the two and of the first one's heading.
+of one member and those offsets, (a, b, c, h, e), and at most in the pose of another, (-a, -b, -c, g): every measurement
+here is one of the vector between the two, or between their tags, and of headings.
 """
 
 import math
@@ -18,6 +18,7 @@ from ..compiling.compile import part
 from ..compiling.vectors import LANES, less, plus, put, take
 from ..gate import FIX_GATE, GATE, count, gate_fix, inflation
 from ..geometry import Numbers, axes, direction
+from ..motion import MotionNoise
 
 HEADING = 3
 """Index of the heading in a member's state."""
@@ -34,8 +35,43 @@ Ends = tuple[int, int, int]
 ALONE: Any = np.int64(-1)
 ZERO: Any = np.int64(0)
 """Numbers of the type of a variable: a literal would compile a function of ends once more."""
-Row = tuple[float, float, float, float, float]
+Row = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
+
+
+class PoseNoise(NamedTuple):
+    """What a pose filter assumes, and how it filters.
+
+    Attributes:
+        fix: three variances, m^2.
+        heading: rad^2, of a compass.
+        relative: three variances, m^2, rad^2, rad^2.
+        odometer: of a velocity, as of the motion of 1 s.
+        yaw_rate: rad^2/s^2.
+        lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, of the offset of ranges, m^2, and of
+            the slow error of a velocity on three axes, m^2/s^2.
+        longer: 1 where that offset is a state, else 0.
+        keep: share of these but the offset that is left after a step.
+        flat: m^2, prior of a member that joins.
+        gate: squared normalised innovation beyond which a measurement weighs less.
+        d: numbers of a member, 4, 6, 7 or 10.
+        passes: of the relative measurements, each linear at the state that the last one found.
+        fusion: JOINT, NAIVE or INTERSECTION.
+    """
+
+    fix: Three
+    heading: float
+    relative: Three
+    odometer: MotionNoise
+    yaw_rate: float
+    lasting: tuple[float, float, float, float, float, float]
+    longer: float
+    keep: float
+    flat: float
+    gate: float
+    d: int = 4
+    passes: int = 1
+    fusion: int = 0
 
 
 class Poses(NamedTuple):
@@ -90,7 +126,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     Args:
         poses: the state.
         ends: of the row.
-        row: (a, b, c, h, o).
+        row: (a, b, c, h, e, g).
         residual: r, at the state.
         variance: of the measurement.
         gate: on r^2 / s.
@@ -100,14 +136,16 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     """
     if poses.totals[PENDING] == ROWS:
         apply_pending_rows(poses)
-    cov, columns, pending, (k, o, p), (a, b, c, h, e) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
-    tiles = len(poses.x) // LANES
+    (k, o, p), (a, b, c, h, e, g), cov, columns = ends, row, poses.cov, poses.columns
+    pending, tiles = int(poses.totals[PENDING]), len(poses.x) // LANES
     for tile in range(tiles):
         x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
         if o >= 0:
             x, y = x - entries(cov, o, tile, tiles), y - entries(cov, o + 1, tile, tiles)
             z = z - entries(cov, o + 2, tile, tiles)
         total = plus(plus(plus(h * entries(cov, k + HEADING, tile, tiles), a, x), b, y), c, z)
+        if g != 0.0:
+            total = plus(total, g, entries(cov, o + HEADING, tile, tiles))
         if e != 0.0:
             total = plus(total, e, entries(cov, k + OFFSET, tile, tiles))
             total = plus(total, e, entries(cov, p, tile, tiles))
@@ -145,12 +183,12 @@ def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
 @part
 def along(column: Floats, ends: Ends, row: Row) -> float:
     """h^T v of a row and a column."""
-    (k, o, p), (a, b, c, h, e) = ends, row
+    (k, o, p), (a, b, c, h, e, g) = ends, row
     total = a * column[k] + b * column[k + 1] + c * column[k + 2] + h * column[k + HEADING]
     if e != 0.0:
         total += e * (column[k + OFFSET] + column[p])
     if o >= 0:
-        total -= a * column[o] + b * column[o + 1] + c * column[o + 2]
+        total += g * column[o + HEADING] - (a * column[o] + b * column[o + 1] + c * column[o + 2])
     return float(total)
 
 
@@ -186,7 +224,7 @@ def wrapped(angle: float) -> float:
 def update_heading(poses: Poses, member: int, heading: float, variance: float, gate: float) -> None:
     """A compass heading rad."""
     residual = wrapped(heading - poses.x[member + HEADING])
-    update_row(poses, (member, ALONE, ALONE), (0.0, 0.0, 0.0, 1.0, 0.0), residual, variance, gate)
+    update_row(poses, (member, ALONE, ALONE), (0.0, 0.0, 0.0, 1.0, 0.0, 0.0), residual, variance, gate)
 
 
 @part
@@ -200,29 +238,40 @@ def update_fix(poses: Poses, member: int, fix: Floats, variance: Three, gate: fl
         own = cov[m, m], xy, xz, xy, cov[m + 1, m + 1], yz, xz, yz, cov[m + 2, m + 2]
         share, hits[m] = gate_fix(gap, own, variance, FIX_GATE / GATE * gate, hits[m])
     for axis in range(3 if math.isfinite(share) else 0):
-        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0)
+        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0, 0.0)
         update_row(poses, (member, ALONE, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
 
 
 @part
-def relative_row(polar: Numbers, heading: float, component: int, measured: float, longer: float) -> tuple[float, Row]:
+def rotated(tag: Floats, heading: float) -> Three:
+    """East, north and up of what is forward, left and up."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return cos * tag[0] - sin * tag[1], sin * tag[0] + cos * tag[1], tag[2]
+
+
+@part
+def relative_row(
+    polar: Numbers, heading: float, tags: tuple[Three, Three], component: int, measured: float, longer: float
+) -> tuple[float, Row]:
     """Residual and row of a range (0), a bearing from the observer's heading (1) or an inclination (2).
 
     Args:
-        polar: form of the vector to the other, at which they are taken.
+        polar: form of the vector to the other, of a range between tags, at which they are taken.
         heading: of the observer, rad.
+        tags: of the observer and the other, m east, north, up.
         component: which of the three.
         measured: m or rad.
         longer: 1 where the offset of ranges is a state, else 0.
     """
     (ray, side, up), d = axes(polar), max(polar[0], MIN_ANGLE_DISTANCE)
     if component == 0:
-        return measured - d, (-ray[0], -ray[1], -ray[2], 0.0, longer)
+        (east, north, _), (right, ahead, _), (x, y, z) = *tags, ray
+        return measured - d, (-x, -y, -z, x * north - y * east, longer, y * right - x * ahead)
     if component == 1:
         flat = max(d * polar[3], MIN_ANGLE_DISTANCE)
         residual = wrapped(measured - math.atan2(polar[1], polar[2]) + heading)
-        return residual, (-side[0] / flat, -side[1] / flat, 0.0, -1.0, 0.0)
-    return wrapped(measured - math.atan2(polar[3], polar[4])), (-up[0] / d, -up[1] / d, -up[2] / d, 0.0, 0.0)
+        return residual, (-side[0] / flat, -side[1] / flat, 0.0, -1.0, 0.0, 0.0)
+    return wrapped(measured - math.atan2(polar[3], polar[4])), (-up[0] / d, -up[1] / d, -up[2] / d, 0.0, 0.0, 0.0)
 
 
 @part
@@ -231,10 +280,9 @@ def update_relative(
     ends: Ends,
     landmark: Floats,
     measured: Floats,
-    variances: Three,
-    gate: float,
-    longer: float,
+    noise: PoseNoise,
     left_out: int,
+    tags: tuple[Floats, Floats],
 ) -> int:
     """The components of one relative measurement, linear at `poses.linear`.
 
@@ -243,26 +291,29 @@ def update_relative(
         ends: observer, the other or -1 for a landmark, and the pair.
         landmark: of the landmark, m.
         measured: m, rad, rad, NaN where missing.
-        variances: of the three.
-        gate: on r^2 / s.
-        longer: 1 where the offset of ranges is a state, else 0.
+        noise: that is assumed.
         left_out: a bit for each component that is left out.
+        tags: of the observer and the other, m forward, left, up.
 
     Returns:
         The bits, and those of the components that are rejected.
     """
     (k, o, p), linear = ends, poses.linear
     position = landmark if o < 0 else linear[o : o + 3]
-    polar = direction((position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2]))
+    x, y, z = position[0] - linear[k], position[1] - linear[k + 1], position[2] - linear[k + 2]
+    own, other = rotated(tags[0], linear[k + HEADING]), rotated(tags[1], linear[o + HEADING] if o >= 0 else 0.0)
+    between = direction((x + other[0] - own[0], y + other[1] - own[1], z + other[2] - own[2]))
+    polar, heading = direction((x, y, z)), linear[k + HEADING]
     curved = curvature(poses.prior_cov, ends, polar)
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):
             continue
-        residual, row = relative_row(polar, linear[k + HEADING], component, measured[component], longer)
+        to = polar if component else between
+        residual, row = relative_row(to, heading, (own, other), component, measured[component], noise.longer)
         residual -= along(poses.x, ends, row) - along(linear, ends, row)
         if row[HEADING + 1] != 0.0:
             residual -= linear[k + OFFSET] + linear[p]
-        if not update_row(poses, ends, row, residual, variances[component] + curved[component], gate):
+        if not update_row(poses, ends, row, residual, noise.relative[component] + curved[component], noise.gate):
             left_out |= 1 << component
     return left_out
 
@@ -286,7 +337,7 @@ def curvature(cov: Floats, ends: Ends, polar: Numbers) -> Three:
 @part
 def gap_cov(cov: Floats, ends: Ends, a: Numbers, b: Numbers) -> float:
     """Covariance m^2, along two directions, of the vector from a member to another or to a landmark."""
-    (k, o, _), row, total = ends, (b[0], b[1], b[2], 0.0, 0.0), 0.0
+    (k, o, _), row, total = ends, (b[0], b[1], b[2], 0.0, 0.0, 0.0), 0.0
     for i in range(3):
         total += a[i] * along(cov[k + i], ends, row)
         if o >= 0:

@@ -238,15 +238,7 @@ def gather(
 
 
 @inner
-def step(
-    f: Filter,
-    tries: Tries,
-    model: Model,
-    own: Floats,
-    rows: Floats,
-    vehicles: Ints,
-    count: int,
-) -> None:
+def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """One step. Where its innovations are unlikely, it is also tried for an ego that slips, or whose odometry fails as
     its fixes show, and the likelier result is kept. Once the ego has met a neighbour, a filter of the ego alone runs
     beside this one.

@@ -30,18 +30,7 @@ from ..gate import (
     vote,
 )
 from ..geometry import Numbers, axes, direction, incomplete, residuals, vector, whole
-from .messages import (
-    BLOCK,
-    ROW,
-    VARIANCE,
-    Star,
-    moved_of,
-    position_of,
-    process_of,
-    relative_of,
-    variance_of,
-    vector_at,
-)
+from .messages import BLOCK, ROW, VARIANCE, Star, moved_of, position_of, process_of, relative_of, variance_of, vector_at
 
 STATE, BEFORE, VOTES = (0.0,) * 13, (0.0,) * 14, (0.0,) * 9
 

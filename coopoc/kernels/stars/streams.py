@@ -110,14 +110,7 @@ def stream_rows(
 
 @compiled
 def stream_step(
-    f: Filter,
-    tries: Tries,
-    model: Model,
-    own: Floats,
-    rows: Floats,
-    vehicles: Ints,
-    start: Floats,
-    answer: Floats,
+    f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
 ) -> bool:
     """One step; False, and nothing changed, where nothing shows yet where the ego is.
 

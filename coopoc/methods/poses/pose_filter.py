@@ -11,6 +11,7 @@ from ...arrays import Bools, Floats, Ints, check_fields, checked, number, refuse
 from ...errors import InputError
 from ...kernels.compiling.waiting import clock
 from ...text import short_repr
+from ...world.body_frames import between_origins
 from ...world.inbox import inbox
 from ...world.links import wrap
 from ...world.plausible import radians
@@ -36,8 +37,7 @@ from .pose_start import likely_poses
 from .pose_stream import PoseStream
 
 if TYPE_CHECKING:
-    from ...kernels.poses.ekf import PoseOptions
-    from ...kernels.poses.odometry import PoseNoise
+    from ...kernels.poses.scalar_update import PoseNoise
 
 PASSES = 3
 """Of the iterated filter: from one more on nothing moves by a hundredth of its standard deviation."""
@@ -51,10 +51,11 @@ Fusion = Literal["joint", "naive", "intersection"]
 class PoseFilter:
     """Extended Kalman filter of (x, y, z, heading) driven by speed and yaw rate, with fixes, compass, ranges, bearings.
 
-    th' = th + dt w, p' = p + dt R(th + dt w / 2) u; range |p_j - p_i|, bearing atan2(p_j - p_i) - th_i; a component
-    that was not measured is no row. A landmark's position is known. With `exact` two more Gauss-Newton steps on the
-    relative measurements follow, from the same prior: the iterated filter. There what is not linear, by second
-    derivatives, counts as noise, so that vague positions do not make exact angles over-confident.
+    th' = th + dt w, p' = p + dt R(th + dt w / 2) u; range |p_j + R(th_j) t_j - p_i - R(th_i) t_i| between `tags` of the
+    recording, bearing atan2(p_j - p_i) - th_i; a component that was not measured is no row. A landmark's position is
+    known. With `exact` two more Gauss-Newton steps on the relative measurements follow, from the same prior: the
+    iterated filter. There what is not linear, by second derivatives, counts as noise, so that vague positions do not
+    make exact angles over-confident.
 
     Args:
         unit: "solo", each vehicle with its landmarks; "fleet", all vehicles.
@@ -153,14 +154,14 @@ class PoseFilter:
             begin = self._begins(recording, columns)
             alone = [self._run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
             x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*alone, strict=True))[:2])
-            theirs = _seen(recording, columns, x, [])
+            theirs, world = _seen(recording, columns, x, []), _in_world(recording, columns, x)
         else:
             members = fleet_members(recording)
             begin = self._begins(recording, members)
             own = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
             in_time = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
             x, cov, _ = self._run_filter(recording, members, own, begin, in_time[:, own])
-            theirs = _seen(recording, columns, x, members)
+            theirs, world = _seen(recording, columns, x, members), _in_world(recording, members, x)
             x, cov = (values[:, :, [members.index(column) for column in columns]] for values in (x, cov))
         if self.unit == "fleet" and self.fusion == "joint":
             both, notes = centre(recording, self.message), (CENTRE,)
@@ -170,7 +171,7 @@ class PoseFilter:
                 messages = inbox(recording, column, self.message)
                 received[:, k], sent[:, k] = messages.received_bytes, messages.sent_bytes
         positions = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
-        notes += doubts(_in_world(recording, columns, x[..., 3]), columns, *positions, neighbours=theirs)
+        notes += doubts(world, columns, *positions, neighbours=theirs)
         extras: dict[str, Floats] = {}
         lasting = "speed_scale", "yaw_rate_bias", "range_offset", *(f"{axis}_error" for axis in ("vx", "vy", "vz"))
         for k, name in enumerate(lasting[: x.shape[-1] - 4], 4):
@@ -231,7 +232,7 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         radians("headings of begin", first[3:])
-        return PoseStream(*self._settings(self.assumed, dt), first, self._spread, dt)
+        return PoseStream(self._settings(self.assumed, dt), first, self._spread, dt)
 
     def _run_filter(
         self,
@@ -259,22 +260,21 @@ class PoseFilter:
         sensors, spread = self.assumed or recording.sensors, self._spread
         if self.spread is None and np.isfinite(recording.gnss[:, :, members]).any():
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
-        noise, options = self._settings(sensors, recording.dt)
+        noise = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
         pairs = 1 + int(measured.ends[:, 2].max(initial=0))
-        poses, pair = new_poses(len(members) * options.d + pairs), new_poses(2 * options.d + 1)
+        poses, pair = new_poses(len(members) * noise.d + pairs), new_poses(2 * noise.d + 1)
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         faults = new_faults(len(members), noise, recording.dt)
-        return run_filter(measured, noise, first, spread, options, poses, pair, faults)
+        return run_filter(measured, noise, first, spread, poses, pair, faults)
 
-    def _settings(self, sensors: Sensors, dt: float) -> "tuple[PoseNoise, PoseOptions]":
+    def _settings(self, sensors: Sensors, dt: float) -> "PoseNoise":
         """What it assumes, and its options, as the kernel takes them."""
-        from ...kernels.poses.ekf import PoseOptions
-
         noise = pose_noise(sensors, dt, self.gate if self.robust else np.inf, self.lasting is not False)
         numbers = 4 + 2 * (self.lasting is True or any(noise.lasting)) + int(noise.longer)
         numbers = 10 if any(noise.lasting[3:]) else numbers
-        return noise, PoseOptions(numbers, PASSES if self.exact else 1, get_args(Fusion).index(self.fusion))
+        passes, fusion = PASSES if self.exact else 1, get_args(Fusion).index(self.fusion)
+        return noise._replace(d=numbers, passes=passes, fusion=fusion)
 
 
 def pose_start(recording: Recording, *, seconds: float = START_SECONDS, gate: float = START_GATE) -> Floats:
@@ -328,11 +328,10 @@ def _seen(recording: Recording, columns: Sequence[int], x: Floats, members: Sequ
     return places[:, links.step[own], links.neighbour[own]]
 
 
-def _in_world(recording: Recording, columns: Sequence[int], heading: Floats) -> Recording:
-    """A recording whose bearings are azimuths, by the headings (R, T, E) rad of the egos."""
-    turn, links = np.zeros(recording.gnss.shape[:3]), recording.links
-    turn[:, :, list(columns)] = heading
-    azimuth = wrap(recording.relative[..., 1] + turn[:, links.step, links.observer])
-    return replace(
-        recording, relative=np.stack([recording.relative[..., 0], azimuth, recording.relative[..., 2]], axis=-1)
-    )
+def _in_world(recording: Recording, members: Sequence[int], x: Floats) -> Recording:
+    """A recording whose bearings are azimuths, and whose ranges are between origins, by the states x (R, T, n, d)."""
+    position, turn, links = recording.gnss.copy(), np.zeros(recording.gnss.shape[:3]), recording.links
+    position[:, :, list(members)], turn[:, :, list(members)] = x[..., :3], x[..., 3]
+    relative = recording.relative.copy()
+    relative[..., 1] = wrap(relative[..., 1] + turn[:, links.step, links.observer])
+    return between_origins(replace(recording, relative=relative), position, turn)

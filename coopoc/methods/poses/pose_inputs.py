@@ -15,7 +15,7 @@ from ...world.v2x import Message
 
 if TYPE_CHECKING:
     from ...kernels.poses.ekf import PoseMeasurements
-    from ...kernels.poses.odometry import PoseNoise
+    from ...kernels.poses.scalar_update import PoseNoise
 
 POSE = Message("pose and covariance", 16)
 """Position and heading (4), covariance (10), id and time (2)."""
@@ -94,7 +94,7 @@ def pose_noise(sensors: Sensors, dt: float, gate: float, lasting: bool = True) -
         gate: standard deviations of an innovation beyond which a measurement is left out.
         lasting: whether errors that last are states, where the sensors have any.
     """
-    from ...kernels.poses.odometry import PoseNoise
+    from ...kernels.poses.scalar_update import PoseNoise
 
     x, y, z = (float(std * std) for std in sensors.fix_std)
     compass = max(float(np.hypot(sensors.heading_std, sensors.heading_bias_std)), LEAST_HEADING_STD)
@@ -145,4 +145,5 @@ def pose_measurements(
         recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark,
         np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),
         recording.dt,
+        np.append(recording.tags[list(members)], [[0.0] * 3], axis=0),
     )

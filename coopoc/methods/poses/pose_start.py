@@ -145,7 +145,8 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     compass = body.heading[0, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
-        return _of_ranges(recording, column, links, places, angles, way)
+        to_tag = turned(recording.tags[column], turns)
+        return _of_ranges(recording, column, links, places, angles, way + to_tag)
     if (
         not len(fixes)
         and np.isnan(body.heading[0, :, column]).all()
@@ -168,8 +169,8 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
 
 
 def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, angles: Floats, way: Floats) -> Floats:
-    """(hypotheses, 4) poses that ranges alone, whose squares differ linearly, leave for each heading, by odometry
-    `way` (T, 3) m."""
+    """(hypotheses, 4) poses that ranges alone, whose squares differ linearly, leave for each heading, by the way
+    (T, 3) m of the tag by odometry."""
     rows = np.flatnonzero(np.isfinite(recording.relative[0, links, 0]))
     at, first = np.unique(places[rows], axis=0, return_index=True)
     if not len(at) or np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), LINE_WIDTH) < 2:

@@ -14,8 +14,7 @@ from ...world.plausible import MAX_SPEED, MAX_YAW_RATE, UNWRAPPED, radians
 from ..motion_history import fix_or_none, relative_vector, three
 
 if TYPE_CHECKING:
-    from ...kernels.poses.ekf import PoseOptions
-    from ...kernels.poses.odometry import PoseNoise
+    from ...kernels.poses.scalar_update import PoseNoise
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +83,23 @@ class PoseEstimate(NamedTuple):
 
 
 class PoseStream:
-    """A pose filter of one's own, step by step (`PoseFilter.start`); fed a recording it gives the numbers of its Track.
+    """A pose filter of one's own, step by step (`PoseFilter.start`), with ranges from its position: fed a recording
+    without tags it gives the numbers of its Track.
 
     Args:
         noise: that is assumed.
-        options: of the filter.
         begin: (4,) m and rad, pose at the first step, NaN for its fix and compass.
         spread: (4,) standard deviations of it.
         dt: s of a step.
     """
 
-    def __init__(self, noise: "PoseNoise", options: "PoseOptions", begin: Floats, spread: Floats, dt: float) -> None:
+    def __init__(self, noise: "PoseNoise", begin: Floats, spread: Floats, dt: float) -> None:
         from ...kernels.poses.odometry import new_faults
         from ...kernels.poses.scalar_update import new_poses
 
-        self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
+        self._noise, self._spread, self._dt = noise, spread, dt
         self._begin, self._later, self._heading = begin[None, None, None], False, np.nan
-        self._poses, self._pair = (new_poses(count * options.d + 1) for count in (1, 2))
+        self._poses, self._pair = (new_poses(count * noise.d + 1) for count in (1, 2))
         self._faults = new_faults(1, noise, dt)
 
     def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
@@ -130,10 +129,10 @@ class PoseStream:
         both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1, 0], (count, 1))
         first = np.array([0, 0, count] if t else [0, count, count])
         active = np.ones((2, 1), dtype=bool)
-        measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt)
+        measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt, np.zeros((2, 3)))
         memory = self._poses, self._pair, self._faults
-        step(measured, self._noise, self._begin, self._spread, self._options, *memory, 0, t)
-        self._later, d = True, self._options.d
+        step(measured, self._noise, self._begin, self._spread, *memory, 0, t)
+        self._later, d = True, self._noise.d
         x = self._poses.x[:d].copy()
         x[3] = wrap(x[3])
         return PoseEstimate(x, self._poses.cov[:d, :d].copy())

@@ -6,6 +6,7 @@ from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.linalg import LinAlgError, eigh, norm, qr
 
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
@@ -88,12 +89,12 @@ def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = F
     (linear, J), still = linearised(problem, x), ~problem.movable
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
     active = active_at(problem, x, gradient.reshape(still.shape))
-    size = float(np.linalg.norm(gradient + active.rows.matrix.T @ active.multipliers))
+    size = float(norm(gradient + active.rows.matrix.T @ active.multipliers))
     try:
         cov, dx, sound = _marginals(J, still, gradient, active)
         if (stated := as_stated(problem)) is not problem:
             cov = _marginals(linearised(stated, x)[1], still, gradient, active)[0]
-    except np.linalg.LinAlgError:
+    except LinAlgError:
         sound = False
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
         unknown = np.full((*still.shape, still.shape[1]), np.nan)
@@ -114,7 +115,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
     none = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
     if not (quick or (np.isfinite(values).all() and np.isfinite(cost))):
         return Assessment(cost, np.inf, none, np.nan)
-    size = float(np.linalg.norm(gradient))
+    size = float(norm(gradient))
     unknown = Assessment(cost, size, none, np.nan)
 
     def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
@@ -206,7 +207,7 @@ def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats
     reduced = ways.T @ hessian @ ways
     factored = cholesky_of(reduced)
     if factored is None:
-        raise np.linalg.LinAlgError("not positive definite")
+        raise LinAlgError("not positive definite")
     return lambda rhs: ways @ factored.solve(ways.T @ rhs), (ways @ reduced @ ways.T).diagonal()
 
 
@@ -238,8 +239,8 @@ def _unobservable(
         every = np.zeros((J.shape[1], len(null)))
         every[measured] = null.T / length[measured, None]
         own = np.arange(len(moving))[:, None] == np.flatnonzero(lost & curved)
-        basis = np.linalg.qr(np.hstack([scale[:, None] * every[moving], own]))[0]
-        values, turned = np.linalg.eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
+        basis = qr(np.hstack([scale[:, None] * every[moving], own]))[0]
+        values, turned = eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
         moves = np.zeros(J.shape[1])
         ways_squared = np.square(basis @ turned)
         moves[moving] = ways_squared[:, np.abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
@@ -271,15 +272,15 @@ def _null_rows(J: Any, length: Floats) -> Floats:
     unit = (J @ diags_array(1.0 / length)).tocsc()
     square = unit.T @ unit
     if len(length) <= DENSE_COLUMNS:
-        values, ways = np.linalg.eigh(square.toarray())
+        values, ways = eigh(square.toarray())
         return ways[:, values <= 1e-10 * values.max(initial=1.0)].T
     shift, factored = 1e-12, None
     while factored is None:
         factored, shift = cholesky_of(with_still(square, np.full(len(length), shift))), 10.0 * shift
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
-        ways = np.linalg.qr(columns_solved(factored, ways))[0]
-    ways = ways @ np.linalg.eigh(ways.T @ (square @ ways))[1]
+        ways = qr(columns_solved(factored, ways))[0]
+    ways = ways @ eigh(ways.T @ (square @ ways))[1]
     return np.asarray(ways[:, ~_seen(unit, ways)].T)
 
 

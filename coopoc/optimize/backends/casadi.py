@@ -120,8 +120,5 @@ def programme(structure: Structure, max_iterations: int, thread: int) -> Any:
 
 
 BACKEND = Backend(
-    "casadi",
-    solver,
-    "casadi",
-    Capabilities(losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
+    "casadi", solver, "casadi", Capabilities(losses=("huber", "cauchy", "geman-mcclure"), constraints="all")
 )

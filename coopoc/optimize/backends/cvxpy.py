@@ -19,9 +19,4 @@ def solver(problem: Problem, x: Floats) -> SolverResult:
     return SolverResult(relaxed.solution.x, relaxed.solution.iterations, extras=extras)
 
 
-BACKEND = Backend(
-    "cvxpy",
-    solver,
-    "cvxpy",
-    QUADRATIC,
-)
+BACKEND = Backend("cvxpy", solver, "cvxpy", QUADRATIC)

@@ -343,8 +343,4 @@ def _robust(model: Any, loss: Loss | None) -> Any:
     return noise.Robust.Create(getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale), model)
 
 
-BACKEND = Backend(
-    "gtsam",
-    solver,
-    "gtsam",
-)
+BACKEND = Backend("gtsam", solver, "gtsam")

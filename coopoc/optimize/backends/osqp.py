@@ -13,6 +13,7 @@ would make 40 of them out of one. A repair solves exactly for the active set tha
 from typing import Any
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
@@ -63,7 +64,7 @@ def solver(
     if held:
         try:
             x, feasible = _nearest(problem, x)
-        except np.linalg.LinAlgError:
+        except LinAlgError:
             return SolverResult(x, 0)
         if not feasible:
             return SolverResult(x, 0, True)
@@ -72,14 +73,14 @@ def solver(
         sides = constraint_rows(problem, x).sides if held else (np.empty(0), np.empty(0))
         try:
             return programme.solve(values, gradient, *sides) if system.cholesky.factor(values) else None
-        except np.linalg.LinAlgError:
+        except LinAlgError:
             return None
 
     end = arrive(system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, held)
     return SolverResult(end.x, end.iterations, extras={"repairs": programme.repairs})
 
 
-class Infeasible(np.linalg.LinAlgError):
+class Infeasible(LinAlgError):
     """No step satisfies the bounds."""
 
 
@@ -114,7 +115,7 @@ class Programme:
                 return dx, float(y @ value)
             self.repairs += attempt < REPAIRS and self._polishing >= active
             self._polish(active)
-        raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
+        raise LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
 
     def update(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> None:
         """Put numbers into the workspace, which the first ones set up."""
@@ -184,9 +185,4 @@ def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     return problem.space.retract(x, step[:size].reshape(len(x), -1)), feasible
 
 
-BACKEND = Backend(
-    "osqp",
-    solver,
-    "osqp",
-    Capabilities(constraints="linear"),
-)
+BACKEND = Backend("osqp", solver, "osqp", Capabilities(constraints="linear"))

@@ -151,10 +151,7 @@ LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, floa
     ),
     "cauchy": (lambda s, c, m: c * c * m.log1p(s / (c * c)), lambda s, c: 1.0 / (1.0 + s / (c * c))),
     "geman-mcclure": (lambda s, c, m: s / (1.0 + s / (c * c)), lambda s, c: (1.0 + s / (c * c)) ** -2.0),
-    "truncated": (
-        lambda s, c, m: m.where(s > c * c, c * c, s),
-        lambda s, c: (s <= c * c).astype(np.float64),
-    ),
+    "truncated": (lambda s, c, m: m.where(s > c * c, c * c, s), lambda s, c: (s <= c * c).astype(np.float64)),
 }
 """rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
 

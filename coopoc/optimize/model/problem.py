@@ -275,13 +275,7 @@ class Problem:
 
     @classmethod
     def from_window(
-        cls,
-        recording: "Recording",
-        step: int,
-        ego: int | str,
-        length: int,
-        run: int = 0,
-        noise: Noise | None = None,
+        cls, recording: "Recording", step: int, ego: int | str, length: int, run: int = 0, noise: Noise | None = None
     ) -> "Problem":
         """The stars of the last `length` steps, one point per vehicle and step, joined by odometry dt u.
 

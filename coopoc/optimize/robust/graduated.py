@@ -149,13 +149,7 @@ class Graduation(NamedTuple):
     settled: bool
 
 
-def graduate(
-    marked: Marked,
-    inner: Inner,
-    x: Floats,
-    mu: float,
-    weight: Floats | None = None,
-) -> Graduation:
+def graduate(marked: Marked, inner: Inner, x: Floats, mu: float, weight: Floats | None = None) -> Graduation:
     """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), mu and weight (G,),
     default ones, until all are 0 or 1."""
     weight = np.ones(len(marked.bound)) if weight is None else weight
@@ -168,11 +162,7 @@ def graduate(
 
 
 def contest(
-    marked: Marked,
-    inner: Inner,
-    start: Floats,
-    finish: Descend,
-    cost: Cost,
+    marked: Marked, inner: Inner, start: Floats, finish: Descend, cost: Cost
 ) -> tuple[str, Floats, Graduation, tuple[str, ...]]:
     """The start of least cost after `finish`, its end (n, ambient), the graduation from the convex surrogate, notes.
 
@@ -282,14 +272,8 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
         steps += end.iterations
         return end.x
 
-    best, x, _, notes = contest(
-        marked,
-        inner,
-        start,
-        lambda at: inner(problem.starting_at(at)),
-        sparse(problem).cost,
-    )
+    best, x, _, notes = contest(marked, inner, start, lambda at: inner(problem.starting_at(at)), sparse(problem).cost)
     name = search.start if best == "x0" and search.start else best
     return problem.starting_at(x).replace_unchecked(
-        search=search._replace(start=name, iterations=search.iterations + steps, notes=(*search.notes, *notes)),
+        search=search._replace(start=name, iterations=search.iterations + steps, notes=(*search.notes, *notes))
     )

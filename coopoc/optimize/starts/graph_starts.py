@@ -232,11 +232,7 @@ def file(graph: Graph) -> Floats:
     return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
 
 
-STARTS = {
-    "odometry": chained,
-    "file": file,
-    "tree": tree,
-}
+STARTS = {"odometry": chained, "file": file, "tree": tree}
 
 
 def contenders(graph: Graph) -> tuple[str, ...]:

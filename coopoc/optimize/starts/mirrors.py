@@ -6,6 +6,7 @@ from itertools import chain, combinations, islice
 from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import eigh, norm
 
 from ...arrays import Bools, Floats, Ints
 from ..assess.assess import squared
@@ -121,17 +122,17 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     table = np.full((n, n), np.inf)
     np.minimum.at(table, tuple(ranges.nodes.T), np.maximum(ranges.distance, 0.0))
     for f in moved:
-        np.minimum.at(table, tuple(f.nodes.T), np.linalg.norm(f.z, axis=1))
+        np.minimum.at(table, tuple(f.nodes.T), norm(f.z, axis=1))
     placed = np.unique(np.concatenate([ranges.nodes, *(f.nodes for f in moved)]))  # no offset is
     fixed = np.setdiff1d(placed, loose)
-    apart = np.linalg.norm(x[fixed, None] - x[fixed], axis=2)
+    apart = norm(x[fixed, None] - x[fixed], axis=2)
     table[np.ix_(fixed, fixed)] = np.where(apart > 0, apart, np.inf)
     table, anchored = np.minimum(table, table.T)[np.ix_(placed, placed)], np.isin(placed, fixed)
     square = np.square(shortest_path(table, directed=False))
     if not np.isfinite(square).all():
         return x
     square -= square.mean(axis=0)
-    values, vectors = np.linalg.eigh(-0.5 * (square - square.mean(axis=1, keepdims=True)))
+    values, vectors = eigh(-0.5 * (square - square.mean(axis=1, keepdims=True)))
     y = np.pad(vectors * np.sqrt(np.maximum(values, 0.0)), ((0, 0), (d, 0)))[:, -d:]
     if len(fixed):
         middle, origin = x[fixed].mean(axis=0), y[anchored].mean(axis=0)
@@ -154,7 +155,7 @@ def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, F
     turn = nearest_rotation(rng.normal(size=(REGISTERED, d, d)))
     for _ in range(REGISTERED):
         gap = arms @ np.swapaxes(turn, 1, 2) + at[:, None] - places
-        to = places + distance[:, None] * gap / np.linalg.norm(gap, axis=2, keepdims=True)
+        to = places + distance[:, None] * gap / norm(gap, axis=2, keepdims=True)
         at = to.mean(axis=1)
         turn = nearest_rotation(np.swapaxes(to, 1, 2) @ arms)
     return turn, at
@@ -173,10 +174,10 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
 
     def costs(at: Floats) -> Floats:
         """(C,) of places (C, K, d) of the body."""
-        return ranges.cost(np.linalg.norm(at[:, index] - places, axis=2).T, rows)
+        return ranges.cost(norm(at[:, index] - places, axis=2).T, rows)
 
     gaps, middle, distance = places - places.mean(axis=0), places.mean(axis=0), ranges.distance[rows]
-    normal = np.linalg.eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, :1]
+    normal = eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(space.dimension) < 2))[1][:, :1]
     image = at - 2.0 * (at - middle) @ normal @ normal.T
     turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))[None]
     met = (at - at.mean(axis=0)) @ turn[0].T + image.mean(axis=0)[None, None]
@@ -190,7 +191,7 @@ def _elsewhere(ranges: Ranges, body: Ints) -> list[Move]:
     chosen, adds = list[int](), costs(met) - costs(at[None])
     for k in np.append(0, adds.argsort()).tolist():
         others = np.concatenate([at[None], met[chosen]])
-        if len(chosen) < MOST_PLACES and np.linalg.norm(met[k] - others, axis=2).max(axis=1).min() > least:
+        if len(chosen) < MOST_PLACES and norm(met[k] - others, axis=2).max(axis=1).min() > least:
             chosen.append(k)
     return [(float(adds[k]), space.join(met[k], turn[k] @ space.rotation(x[body])), body) for k in chosen]
 
@@ -280,7 +281,7 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
     a, b = pairs.T
     move = turns(error)
     left = error + move[b] - move[a]
-    size = np.linalg.norm(left, axis=1)
+    size = norm(left, axis=1)
     own, other, both = factored.inverse(np.concatenate([a, b, a]), np.concatenate([a, b, b])).reshape(3, -1)
     closed = 1.0 - (own + other - 2.0 * both) / v
     adds = np.where(closed > BRIDGE, (2.0 * np.pi / v) * (np.pi * closed - size), np.inf)

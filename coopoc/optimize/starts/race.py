@@ -63,7 +63,8 @@ def race(
         reached: (n, ambient) the end of the descent from an x0, which competes.
     """
     system, taken, arrived = sparse(problem), 0, True
-    tried = {} if reached is None else {"x0": (system.cost(reached), reached)}
+    cost_of = system.cost
+    tried = {} if reached is None else {"x0": (cost_of(reached), reached)}
     straight, late = set(), dict(late)
     rough, calm, minima = list[str](), list[float](), list[float]()
     mean, variance = expected(problem, system.size)
@@ -79,7 +80,7 @@ def race(
     def attempt(name: str, x: Floats, steps: int, smooth: bool = False) -> Arrival:
         nonlocal taken
         end = arrive(system, x, steps, RACE_TOLERANCE, smooth=smooth)
-        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
+        tried[name], taken = (cost_of(end.x), end.x), taken + end.iterations
         return end
 
     def least_of_all() -> float:
@@ -89,11 +90,11 @@ def race(
         nonlocal taken
         y, steps = late.pop(name)(problem.starting_at(x))
         y, taken = descend(y), taken + steps
-        tried[name] = system.cost(y), y
+        tried[name] = cost_of(y), y
         return y
 
     def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
-        return arrived and bool(abs(system.cost(x) - mean) <= usual)
+        return arrived and bool(abs(cost_of(x) - mean) <= usual)
 
     def landed(x: Floats) -> Floats:
         end = descend(x, LATER_STEPS)
@@ -103,13 +104,13 @@ def race(
         ends = list[tuple[float, Floats]]()
         if draws:
             x = descend(x, LATER_STEPS)
-            y, ends = drawn(scattered(problem, x), x, landed, system.cost)
+            y, ends = drawn(scattered(problem, x), x, landed, cost_of)
             name, x = (name if y is x else "drawn"), y
-        x, moves, others = across(problem, x, landed, system.cost)
-        name, cost = name + ", moved" * (moves > 0), system.cost(x)
+        x, moves, others = across(problem, x, landed, cost_of)
+        name, cost = name + ", moved" * (moves > 0), cost_of(x)
         costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
         ends += [*others, *((each, x) for each in minima)]
-        notes = doubts(x, ends, system.cost) or (() if sure else reached_once(costs, cost))
+        notes = doubts(x, ends, cost_of) or (() if sure else reached_once(costs, cost))
         return problem.starting_at(x), Search(name, taken, notes=notes)
 
     relative = all(f.measurement.compares_poses for f in problem.factors)
@@ -146,7 +147,7 @@ def race(
             if explained(x):
                 break
             y = follow(other, x)
-            name, x = (other, y) if tried[other][0] < (1.0 - SAME_COST) * system.cost(x) else (name, x)
+            name, x = (other, y) if tried[other][0] < (1.0 - SAME_COST) * cost_of(x) else (name, x)
     return ended(name, x)
 
 
