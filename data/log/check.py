@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.linalg import norm
 
 from coopoc.arrays import Floats
 from coopoc.methods.noise_model import NoiseModel
@@ -22,7 +23,9 @@ from .estimates import (
     LEAST_SCALE,
     LEAST_TURN,
     LONG_LAG,
+    MAY,
     OUTLYING,
+    PERHAPS,
     SURE_ERRORS,
     TENTHS,
     against_truth,
@@ -58,8 +61,6 @@ UNUSED_SHARE = 0.05
 """Share of the logged rows that may be left out without a sentence."""
 AXIS_TURN = 20.0
 """Degrees by which odometry is turned from which its forward axis is another."""
-PERHAPS = 2.0
-"""Standard errors from which an error may be real, and is named as not known."""
 FAR_AWAY = 3e5
 """m, from all others, where no vehicle cooperates."""
 LEAST_BACK = 0.02
@@ -142,7 +143,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
     errors = "speed_excess", turned, "fixes_late_s" if truth is None else "late_s", "beside_east", "beside_north"
     for column, name in enumerate(rec.ids):
         fixed = np.isfinite(c.normalised[:, column])
-        speed, fixes = np.linalg.norm(rec.velocity[0, :, column], axis=-1), pd.DataFrame(rec.gnss[0, :, column])
+        speed, fixes = norm(rec.velocity[0, :, column], axis=-1), pd.DataFrame(rec.gnss[0, :, column])
         if not max(np.nanmax(speed, initial=0.0), *(fixes.max() - fixes.min())) > 0:  # a place
             continue
         wheels, ratio = odometry(c, column), ratio_of_moves(c, column)
@@ -189,8 +190,8 @@ def _axes(c: Check, column: int) -> str:
             "both swapped, or is it in another frame?"
         )
     moved, driven, *_ = moves(c, column)
-    length = np.linalg.norm(moved)
-    size = length * np.linalg.norm(driven)
+    length = norm(moved)
+    size = length * norm(driven)
     u = rec.velocity[0, rec.present[:, column], column, :2]
     height = pd.Series(rec.gnss[0, :, column, 2]).dropna()
     climbed = pd.Series(rec.velocity[0, :, column, 2] * rec.dt).cumsum()[height.index]
@@ -200,7 +201,7 @@ def _axes(c: Check, column: int) -> str:
         return ""
     both = np.stack([driven, driven.conj()], axis=1)  # swapped degrees have other lengths; one axis, both
     (turn, mirror), *_ = np.linalg.lstsq(both, moved)
-    if abs(mirror) > 2 * abs(turn) and np.linalg.norm(both @ [turn, mirror]) > LEAST_CORRELATION * length:
+    if abs(mirror) > 2 * abs(turn) and norm(both @ [turn, mirror]) > LEAST_CORRELATION * length:
         return (
             f"axes look swapped or mirrored: fixes move as odometry mirrored at {np.angle(mirror, deg=True) / 2:.0f}"
             " deg from +x. At 45, swap easting and northing, latitude and longitude, or vx and vy; headings clockwise "
@@ -259,7 +260,10 @@ def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
         f"{row['worst_at_s']:.3g} s on: see the other lines, or the stated noise is wrong."
         for row in sorted(c.vehicles, key=lambda row: -row["per_std"])
         if row["per_std"] > CONFIDENT_RATIO
-        and (row["misses"] == "filter errs" or not any(one.startswith(f"{row['vehicle']}: ") for one in named))
+        and (
+            row["misses"] == "filter errs"
+            or not any(one.startswith(f"{row['vehicle']}: ") and MAY not in one for one in named)
+        )
     ]
 
 
@@ -271,10 +275,11 @@ def _of_vehicles(c: Check) -> list[str]:
 def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     """Of one; odometry that fails, or noise that is not as stated, where nothing else explains it."""
     name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
-    column, sentences = c.world.ids.index(name), []
+    column, sentences = c.world.ids.index(name), list[str]()
+    say = sentences.append
     share = c.wild[column] / max(row["fixes"] + c.wild[column], 1)
     if share > OUTLIER_SHARE and c.wild[column] > LEAST_OUTLIERS:
-        sentences.append(
+        say(
             f"{name}: {share:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: outliers, "
             "which a filter without a gate follows."
         )
@@ -283,7 +288,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     if axes or any(what.startswith(FAULTS[1]) and name in who for what, who in c.log.summary.assumed.items()):
         return sentences
     if _beyond(row, "fixes_late_s", BEHIND):
-        sentences.append(
+        say(
             f"{name}: its fixes are {abs(row['fixes_late_s']):.2f} +- {row['fixes_late_s_error']:.2f} s "
             f"{'behind' if row['fixes_late_s'] > 0 else 'ahead of'} its odometry: clocks differ, or the receiver "
             "smooths them. It cannot be said yet whether the odometry errs."
@@ -291,7 +296,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     east, north = row.get("beside_east", 0.0), row.get("beside_north", 0.0)
     unsure = np.hypot(row.get("beside_east_error", 0.0), row.get("beside_north_error", 0.0))
     if (pace := float(np.hypot(east, north))) > max(BESIDE, SURE_ERRORS * unsure):
-        sentences.append(
+        say(
             f"{name}: it moves by {pace:.2f} +- {unsure:.2f} m/s towards "
             f"{np.degrees(np.arctan2(north, east)):.0f} deg from +x relative to its odometry: wind, a "
             f"current, a ferry; or fixes that drift. offset={name}.vx:{-east:.2g},{name}.vy:{-north:.2g} takes it off; "
@@ -299,47 +304,48 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
             f"{pace * (len(c.world.t) / row['fixes']) ** 0.5:.2g} m/s."
         )
     if turn is not None and abs(turn) > AXIS_TURN:
-        sentences.append(
+        say(
             f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
             f"look turned by {-turn:.0f} deg. Speeds are positive forward, headings anticlockwise from +x (east), "
             "rad; clockwise from north in degrees is compass_deg."
         )
-    elif turn is not None and _beyond(row, "turned", LEAST_TURN):
-        sentences.append(
-            f"{name}: its odometry is turned by {np.rad2deg(row['turned']):.2f} +- "
+    elif turn is not None and (may := _may(row, "turned", LEAST_TURN)):
+        say(
+            f"{name}: its odometry {may} turned by {np.rad2deg(row['turned']):.2f} +- "
             f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, the mounting of a sensor, "
             "or, on a bend at one speed, a clock."
         )
     if distance is not None and not 0.8 <= distance <= 1.25:
         unit = next((hint for low, high, hint in WRONG_UNITS if low < distance < high), "Check the units of both.")
-        sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
-    elif name in c.failing and not sentences:
+        say(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
+    elif name in c.failing and all(MAY in one for one in sentences):
         moved, driven, *_ = moves(c, column)
         back = np.abs(moved + driven) < 0.5 * np.abs(moved)
         cause = "slips, or a speed or heading that is held or wrong."
         if back.sum() >= 3 and back.mean() > LEAST_BACK:
             cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
-        sentences.append(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
+        say(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
     elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
-        sentences.append(
+        say(
             f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "
             "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
         )
         return sentences
-    elif _beyond(row, "speed_excess", LEAST_SCALE):
-        sentences.append(
-            f"{name}: its odometry is too {'fast' if row['speed_excess'] > 0 else 'slow'} by "
+    elif may := _may(row, "speed_excess", LEAST_SCALE):
+        say(
+            f"{name}: its odometry {may} too {'fast' if row['speed_excess'] > 0 else 'slow'} by "
             f"{100 * abs(row['speed_excess']):.2f} +- {100 * row['speed_excess_error']:.2f} %: "
             f"scale={name}.speed:{1 / (1 + row['speed_excess']):.4g} mends it (or of .vx and .vy), and a pose filter "
             "estimates it."
         )
-    if _beyond(row, "yaw_rate_bias", LEAST_DRIFT):
-        sentences.append(
-            f"{name}: its yaw rates are too large by {row['yaw_rate_bias']:.2g} +- "
+    if may := _may(row, "yaw_rate_bias", LEAST_DRIFT):
+        say(
+            f"{name}: the bias of its yaw rates {may} {row['yaw_rate_bias']:.2g} +- "
             f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
         )
-    if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= (np.inf if sentences else 2.0):
-        sentences.append(
+    most = 2.0 if all(MAY in one for one in sentences) else np.inf
+    if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= most:
+        say(
             f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
             "as stated, or correlated in time. Give std columns or sensors=."
             + " Were variances given as deviations?"
@@ -348,9 +354,14 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
-    """Whether an estimate of a row is larger than that, and than chance."""
-    return float(abs(row.get(name) or 0.0)) > max(least, SURE_ERRORS * (row.get(f"{name}_error") or 0.0))
+def _beyond(row: Mapping[str, Any], name: str, least: float, errors: float = SURE_ERRORS) -> bool:
+    """Whether an estimate of a row is larger than that, and than so many standard errors."""
+    return float(abs(row.get(name) or 0.0)) > max(least, errors * (row.get(f"{name}_error") or 0.0))
+
+
+def _may(row: Mapping[str, Any], name: str, least: float) -> str:
+    """Whether an estimate "is" or "may be" more than chance; "" if not."""
+    return "is" if _beyond(row, name, least) else MAY * _beyond(row, name, least, PERHAPS)
 
 
 def _late(c: Check, row: Mapping[str, Any]) -> bool:
@@ -443,7 +454,7 @@ def _of_fixes(c: Check) -> Iterator[str]:
             )
         unsure = min(OFFSET_ERRORS * np.hypot(east[1], north[1]), FRAME_STDS * usual)
         if np.hypot(east[0], north[0]) > max(unsure, usual / 2):
-            theirs = np.linalg.norm(rec.gnss[0, :, column, None, :2] - truth.position[..., :2], axis=-1)
+            theirs = norm(rec.gnss[0, :, column, None, :2] - truth.position[..., :2], axis=-1)
             like = [one for one, far in zip(rec.ids, pd.DataFrame(theirs[both]).median(), strict=True) if far < usual]
             hint = "Has it another frame? Fixes in degrees are local at the first: give origin= of the truth, or it in "
             hint = f"They follow the truth of {like[0]}: are names exchanged?" if like else f"{hint}degrees."
@@ -466,12 +477,6 @@ def _unseen(c: Check) -> Iterator[str]:
         errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", np.inf) for row in c.vehicles}
         if blind := _below(errors, 2 * least):
             yield f"errors, {what} of {blind}"
-        for row in c.vehicles:
-            value, error = row.get(name, 0.0), row.get(f"{name}_error", np.inf)
-            if max(least, PERHAPS * error) < abs(value) <= SURE_ERRORS * error:
-                yield (
-                    f"whether an error of {value:.2g} +- {error:.2g} ({what} of {row['vehicle']}) is more than chance"
-                )
     late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
     if blind := _below(
         {who: SURE_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG

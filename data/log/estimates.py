@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 import scipy  # as in `residuals`
+from numpy.linalg import inv, lstsq, norm
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
@@ -15,8 +16,11 @@ from coopoc.world.links import wrap
 from .motion import COURSE, MOVING, OF_FASTEST
 from .residuals import Check, distances, filtered, in_space, plane, residual_of
 
-SURE_ERRORS, SURE_CLOCK_ERRORS = 4.0, 5.0
-"""Standard errors beyond which an estimate is significant, of many in a few logs; and one of clocks and ranges."""
+PERHAPS, SURE_ERRORS, SURE_CLOCK_ERRORS = 2.0, 4.0, 5.0
+"""Standard errors beyond which an estimate may be more than chance; is significant, of many in a few logs; and one of
+clocks and ranges."""
+MAY = "may be"
+"""Words of a sentence on an error that is beyond PERHAPS of its standard errors, and not beyond SURE_ERRORS."""
 LEAST_LAG, LEAST_SCALE, LEAST_TURN, LEAST_DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 BESIDE, BEHIND = 0.1, 0.1
@@ -90,7 +94,7 @@ def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, 
         factor = np.zeros(k)
         for _ in range(3):
             sums = (z[used].T @ all_of[used, : k + 1]).real
-            factor = np.linalg.lstsq(sums[:, 1:], sums[:, 0])[0]
+            factor = lstsq(sums[:, 1:], sums[:, 0])[0]
             gap = np.abs(y - x @ factor)
             used = used & (gap <= OUTLYING * np.median(gap[used]))
         return factor
@@ -185,9 +189,9 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
 def ratio_of_moves(c: Check, column: int) -> complex | None:
     """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
     moved, driven, *_ = moves(c, column)
-    ratio = np.vdot(driven, moved) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
-    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - LEAST_CORRELATION**2) ** 0.5 * np.linalg.norm(moved))
-    return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
+    ratio = np.vdot(driven, moved) / max(float(norm(driven)) ** 2, 1e-12)
+    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - LEAST_CORRELATION**2) ** 0.5 * norm(moved))
+    return ratio if len(moved) and norm(moved - ratio * driven) < most else None
 
 
 def odometry(c: Check, column: int) -> Estimate:
@@ -220,7 +224,7 @@ def odometry(c: Check, column: int) -> Estimate:
             along = driven.conj() / np.abs(driven)  # across, a heading that is derived follows the fixes
             y, causes, span = (y * along).real + 0j, (causes * along).real + 0j, 0.0 * span
         value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
-        attenuation = (np.linalg.norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
+        attenuation = (norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
         turned = (1 + complex(*value[:2])) * (1 + attenuation)
         if abs(turned.real) < LEAST_FORWARD:
             return none
@@ -241,7 +245,7 @@ def odometry(c: Check, column: int) -> Estimate:
     used = np.isfinite(odometer + x.sum(axis=0))
     pace = np.maximum(np.abs(true), np.abs(odometer))
     used &= pace > min(MOVING, OF_FASTEST * np.nanmax(pace, initial=0.0))  # standing, nothing errs
-    constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), np.linalg.norm(noise) / len(noise) ** 0.5
+    constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), norm(noise) / len(noise) ** 0.5
     value, error = _of_motion((odometer - true)[used], x[:, used], constant, usual)
     forward = 1 + value[0]
     late = -value[2] / forward if abs(forward) > LEAST_FORWARD else np.inf
@@ -263,12 +267,12 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
     made = no_estimate(5)
     for causes, extra in ((np.concatenate([x, [constant, 1j * constant]]), [-2, -1]), (x, [2]), (x[:2], [])):
         unit = np.concatenate([causes.real, causes.imag], axis=1)
-        unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
-        alone = 1.0 / np.diag(np.linalg.inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
+        unit /= np.maximum(norm(unit, axis=1, keepdims=True), 1e-12)
+        alone = 1.0 / np.diag(inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
         if extra and ((alone < MIN_OWN_SHARE) & unit.any(axis=1)).any():
             continue
         explained = factors(y, causes.T, noise)
-        if np.linalg.norm(explained.value[extra]) >= 2.0 * np.linalg.norm(explained.error[extra]):
+        if norm(explained.value[extra]) >= 2.0 * norm(explained.error[extra]):
             break
     of_causes = min(len(causes), 3)
     for whole, part in zip(made, explained, strict=True):
@@ -378,7 +382,7 @@ def _beside(off: AnyArray, velocity: AnyArray) -> float:
     one velocity a lag is no explanation."""
     finite = np.isfinite(off + velocity)
     x = np.column_stack([np.ones(finite.sum()), velocity[finite]])
-    beside = abs(np.linalg.lstsq(x, off[finite])[0][0])
+    beside = abs(lstsq(x, off[finite])[0][0])
     return float(min(beside, abs(off[finite].mean())) if finite.any() else 0.0)
 
 

@@ -15,9 +15,11 @@ from .estimates import (
     LEAST_COUNT,
     LONG_LAG,
     LONGEST_LAG,
+    MAY,
     MOVED_STDS,
     NUDGE_STEP,
     OUTLYING,
+    PERHAPS,
     SURE_ERRORS,
     factors,
     median,
@@ -213,16 +215,19 @@ def of_measurements(c: Check) -> Iterator[str]:
                 f"{', ...' * (len(misfits) > NAMED_CASES)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
                 "position or clock, or a value that is held."
             )
-        if pairs and (not wrong or hint == HINTS["range"]):
-            shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
-            offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
+        for verb in ["are"] * (not wrong or hint == HINTS["range"]) + [MAY] * (not wrong):
+            some = [one for one in pairs if (abs(one[1]) > SURE_ERRORS * one[2]) == (verb != MAY)]
+            if not some:
+                continue
+            shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in some)
+            offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in some)
             yield (
-                f"{word}s of {shown} are off in the median, with {least:.3g} {unit} stated: an "
+                f"{word}s of {shown} {verb} off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (
                     f"offset={offsets_text} takes it off."
                     if word == "range"
-                    else f"if of all that one measures, offset={pairs[0][0].split(' to ')[0]}.{word}:{pairs[0][1]:.3g} "
+                    else f"if of all that one measures, offset={some[0][0].split(' to ')[0]}.{word}:{some[0][1]:.3g} "
                     "takes it off (named and in the unit as logged)."
                 )
             )
@@ -267,14 +272,15 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
 
 
 def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
-    """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with the medians
-    and their standard errors, largest first: by parts of the drive, and by the errors of the filters, which last."""
+    """Pairs whose measurements of one kind are off by more than PERHAPS errors and a quarter of their noise, with
+    medians and their standard errors, largest first: by parts of the drive, and by errors of the filters, which
+    last."""
     named, lasts, names = [], share(c), pairs(c, k, k > 0)
     for pair, rows in names.groupby(names).groups.items():
         offset, error = median(c.relative[rows, k])
         position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
         error = float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
-        if abs(offset) > max(SURE_ERRORS * error, 0.25 * stated):
+        if abs(offset) > max(PERHAPS * error, 0.25 * stated):
             named.append((str(pair), offset, error))
     return sorted(named, key=lambda row: -abs(row[1]))
 
