@@ -115,7 +115,7 @@ def between_origins(recording: Recording, position: Floats, heading: Floats) -> 
         for ends in (position, tips)
     )
     relative[..., 0] = np.maximum(relative[..., 0] + far - longer, TINY)
-    return replace(recording, relative=relative, tags=())
+    return replace(recording, relative=relative, tags=0.0 * recording.tags)
 
 
 def body_measurements(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> tuple[Floats, Body]:
