@@ -15,9 +15,9 @@ MODELS = ["identity", "nominal", "fitted"]
 
 def _grid() -> list[Params]:
     """Every method at every K."""
-    solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), BOUND, *(("kalman", model) for model in MODELS)]
+    solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), *(("kalman", model) for model in MODELS)]
     shared = [(m, model) for m in lineup.COOPERATIVE for model in MODELS]
-    return [of(*pair, max_neighbours=k) for k in NEIGHBOURS for pair in (*solo, *shared)]
+    return [of(*pair, max_neighbours=k) for k in NEIGHBOURS for pair in (*solo, *shared, BOUND)]
 
 
 def _meaningful(p: Params) -> bool:
