@@ -109,10 +109,11 @@ def read_bag(
                 what[c.topic], *fields[c.topic] = READ[c.msgtype].split()
             of = _vehicles(what, truth, path.stem)
             for c in reader.connections:
-                if not topics[c.topic]:
-                    summary.unused[f"{path.name}: topic {c.topic} ({c.msgtype})"] += c.msgcount
-                elif what[c.topic] == "odometry" and of[c.topic][1]:
-                    fields[c.topic] = [f"pose.{field}" for field in POSE.split()]
+                topic = c.topic
+                if not topics[topic]:
+                    summary.unused[f"{path.name}: topic {topic} ({c.msgtype})"] += c.msgcount
+                elif what[topic] == "odometry" and of[topic][1]:
+                    fields[topic] = [f"pose.{field}" for field in POSE.split()]
             for number, (c, received, raw) in enumerate(reader.messages(connections=wanted) if wanted else (), 1):
                 message: Any = reader.deserialize(raw, c.msgtype)
                 stamp, arrived = message.header.stamp, received * 1e-9

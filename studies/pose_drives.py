@@ -121,13 +121,14 @@ def _mrclam(folder: Path) -> Source:
 
 def _logged(log: Log, span: str) -> Source:
     """Of a log in body frames its longest part in which all vehicles are there, and where that is in words."""
-    stated, truth, marks = log.recording.sensors, log.truth, len(log.recording.landmarks)
+    recording, truth = log.recording, log.truth
+    stated, marks = recording.sensors, len(recording.landmarks)
     begun = cache(lambda: begin_of(log))
 
     def drive(until: float, v2x: V2X) -> Drive:
         begin, spread, _ = begun()
         lasting = max(stated.speed_scale_std, stated.yaw_rate_bias_std, stated.range_offset_std) > 0
-        return Drive(under(log.recording, v2x, logged=log.messages), begin, truth, lasting, spread)
+        return Drive(under(recording, v2x, logged=log.messages), begin, truth, lasting, spread)
 
     def text() -> str:
         read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
@@ -136,9 +137,9 @@ def _logged(log: Log, span: str) -> Source:
         return f"What {{}} holds ({read}),{where} {noise}"
 
     posed = truth is not None and truth.heading is not None
-    digests = {"log": digest(log.recording), "truth": truth.digest if truth else ""}
-    seconds, made = float(np.ptp(log.recording.t)), lru_cache(maxsize=2)(drive)
-    vehicles = len(log.recording.vehicles)
+    digests = {"log": digest(recording), "truth": truth.digest if truth else ""}
+    seconds, made = float(np.ptp(recording.t)), lru_cache(maxsize=2)(drive)
+    vehicles = len(recording.vehicles)
     return Source(seconds, vehicles, marks, posed, digests, made, lambda until: begun(), text)
 
 

@@ -124,15 +124,16 @@ def sensors(p: Params) -> Sensors:
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
-    noise = lasting(presets[p["scenario"]](), *(p.get(name, 0.0) for name in LASTING_SHARES))
+    get = p.get
+    noise = lasting(presets[p["scenario"]](), *(get(name, 0.0) for name in LASTING_SHARES))
     return replace(
         noise,
         velocity_std_ratio=p["velocity_ratio"],
         velocity_reading=p["velocity_reading"],
-        gnss_drift_time=p.get("drift_time_s", noise.gnss_drift_time),
-        heading_std=np.deg2rad(p.get("heading_std_deg", 0.0)),
-        heading_bias_std=np.deg2rad(p.get("heading_bias_deg", 0.0)),
-        outliers=Outliers.named(p["outliers"]) if p.get("outliers") else None,
+        gnss_drift_time=get("drift_time_s", noise.gnss_drift_time),
+        heading_std=np.deg2rad(get("heading_std_deg", 0.0)),
+        heading_bias_std=np.deg2rad(get("heading_bias_deg", 0.0)),
+        outliers=Outliers.named(p["outliers"]) if get("outliers") else None,
     )
 
 

@@ -16,10 +16,6 @@ def compiled(tables: str, folder: Path) -> str:
         pytest.skip("LaTeX has no booktabs: apt-get install texlive-latex-recommended")
     source = r"\documentclass{article}\usepackage{booktabs,graphicx}\begin{document}" + tables + r"\end{document}"
     (folder / "t.tex").write_text(source)
-    done = ran(
-        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"],
-        cwd=folder,
-        timeout=60,
-    )
+    done = ran(["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"], cwd=folder, timeout=60)
     assert done.returncode == 0, done.stdout[-2000:]
     return done.stdout

@@ -76,13 +76,7 @@ random_drive = partial(random_graph, robots=1, landmarks=0, ranges=0)
 """Odometry and loops of one robot."""
 
 
-def star(
-    kind: str,
-    seed: int,
-    neighbours: int = 6,
-    fix_std: float = 2.0,
-    height: float = 0.2,
-) -> Problem:
+def star(kind: str, seed: int, neighbours: int = 6, fix_std: float = 2.0, height: float = 0.2) -> Problem:
     """An ego with ranges to, or azimuths of, its neighbours, and fixes."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (neighbours, 3)) * [1, 1, height]])

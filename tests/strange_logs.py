@@ -26,11 +26,12 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         fault: `pairs` (a, b) -> m, `clocks` s, `wheels` (share of the speed) and `tags` m of vehicles, `late` fixes s,
             `unit` of ranges, `tunnel` (from, to) s without fixes, `body` where drones log velocities in theirs.
     """
+    get = fault.get
     count, pace, apart, climb, fix, reach, rates = KINDS[kind]
     rng, noise, t = np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.02 * np.arange(int(seconds * 50))
     drones, cars, robots = (kind == name for name in KINDS)
     names, axes = [f"{kind}{k}" for k in range(count)], list("xyz" if drones else "xy")
-    (begin, end), body = fault.get("tunnel", (-1, -1)), "body" in fault
+    (begin, end), body = get("tunnel", (-1, -1)), "body" in fault
     place, tip, speed, course, tables = {}, {}, {}, {}, []
     shape = rng.uniform(0.6, 1.4, (count, 3))
     for k, name in enumerate(names):
@@ -40,7 +41,7 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         path = np.cumsum(0.02 * speed[name] * np.exp(1j * course[name]))
         path += -k * apart if cars else apart * np.exp(1.9j * k) * (k > 0)
         place[name] = np.c_[path.real, path.imag, climb * np.sin(0.1 * t + k)]
-        ahead, left, up = fault.get("tags", {}).get(name, (0, 0, 0))
+        ahead, left, up = get("tags", {}).get(name, (0, 0, 0))
         aside = np.exp(1j * course[name]) * (ahead + 1j * left)
         tip[name] = place[name] + np.c_[aside.real, aside.imag, 0 * t + up]
     tip |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
@@ -51,14 +52,14 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
     def add(name, times, kinds, values, std, **more):
         values = values + noise.normal(0, std, values.shape)
         columns = dict(zip(kinds, values.T, strict=True)) | {f"{one}_std": std for one in kinds}
-        now = times + fault.get("clocks", {}).get(name, 0.0)
+        now = times + get("clocks", {}).get(name, 0.0)
         frame = pd.DataFrame({"t": now, "vehicle": name, **columns, **more})
         tables.append(frame[frame[kinds[0]].gt(0) | (kinds[0] != "range")])
 
     for k, name in enumerate(names):
         fixed, moved, ranged = (np.arange(1 + 0.01 * k, seconds - 1, 1 / hertz / rate) for hertz in rates)
         fixed = fixed[(fixed < begin) | (fixed > end)]
-        scale, late = 1 + fault.get("wheels", {}).get(name, 0.0), fault.get("late", 0.0)
+        scale, late = 1 + get("wheels", {}).get(name, 0.0), get("late", 0.0)
         if not robots:
             fixes = at(place[name], fixed)[:, : len(axes)]
             add(name, fixed + late, axes, fixes, fix)
@@ -76,7 +77,7 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
             add(name, moved, ["heading"], at(course[name], moved), 0.01)
         for other in names[k - 1 : k] if cars else [one for one in tip if one != name]:
             gap = at(tip[other], ranged) - at(tip[name], ranged)
-            pairs, unit = fault.get("pairs", {}), fault.get("unit", 1.0)
+            pairs, unit = get("pairs", {}), get("unit", 1.0)
             far = np.linalg.norm(gap, axis=1, keepdims=True) + pairs.get((name, other), pairs.get((other, name), 0.0))
             add(name, ranged, ["range"], far / unit, reach / unit, partner=other)
             if cars:

@@ -53,13 +53,7 @@ def test_solo_anchors(method, ratio, expected, formation):
 
 @pytest.mark.parametrize(
     ("neighbours", "identity", "weighted"),
-    [
-        (1, 3.00, 0.70),
-        (2, 2.48, 0.62),
-        (4, 1.98, 0.51),
-        (6, 1.66, 0.46),
-        (10, 1.35, 0.37),
-    ],
+    [(1, 3.00, 0.70), (2, 2.48, 0.62), (4, 1.98, 0.51), (6, 1.66, 0.46), (10, 1.35, 0.37)],
 )
 def test_laplacian_filter_anchors(neighbours, identity, weighted, formation):
     recording = fixture(formation, neighbours)

@@ -125,12 +125,7 @@ def test_tables_on_stdout(folder):
 @pytest.mark.parametrize("format", ["markdown", "latex"])
 def test_a_reader_that_leaves_early_is_no_error(folder, format):
     words = " ".join([*COMMAND, "table", "runs/small", "--format", format])
-    done = ran(
-        ["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"],
-        cwd=folder,
-        env=ENV,
-        timeout=60,
-    )
+    done = ran(["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"], cwd=folder, env=ENV, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
 
 

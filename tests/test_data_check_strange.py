@@ -117,6 +117,26 @@ def test_ranges_of_a_convoy_look_like_no_scale_where_a_clock_differs(tmp_path):
     assert re.fullmatch(r"car1: its clock is 0\.(2[5-9]|3)\S* \+- 0\.0[12]\S+ s ahead of .*", said(folder))
 
 
+@pytest.mark.parametrize(("kind", "odometry", "truth"), [("car", 0, 1), ("drone", 0, 0), ("car", 1, 0), ("car", 1, 1)])
+def test_a_base_station_that_is_lost_is_named(tmp_path, kind, odometry, truth):
+    """All fixes shift by 5 m for 40 s; without odometry a truth shows it, or the fixes that jump."""
+    folder = strange(tmp_path / "log", kind, 1)
+    log = pd.read_csv(folder / "log.csv")
+    part = log["t"].between(60, 100)
+    log = log.assign(x=log["x"] + 4 * part, y=log["y"] - 3 * part)
+    log.filter(regex="." if odometry else "^(?!speed|yaw|heading|v[xyz])").to_csv(folder / "log.csv")
+    if not truth:
+        (folder / "truth.csv").unlink()
+    assert "all vehicles at once, from" in said(folder)
+
+
+def test_a_position_filter_notes_offsets_of_pairs(tmp_path):
+    for pairs, named in ((PAIRS, True), ({}, False)):
+        recording = load_log(str(strange(tmp_path / f"{named}", "drone", 1, pairs=pairs))).recording
+        for method, has in ((co.JointFilter(), named), (co.BatchSmoother(), named), (co.Kalman(), False)):
+            assert ("drone0 and drone2 contradict fixes by an offset" in str(method(recording).notes)) == has
+
+
 def test_what_lies_between_two_and_four_standard_errors_may_be(tmp_path):
     folder = strange(tmp_path / "log", "drone", 1, wheels={"drone1": 0.015}, pairs={("drone0", "drone3"): 0.16})
     (folder / "truth.csv").unlink()

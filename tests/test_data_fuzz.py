@@ -15,14 +15,15 @@ CORPUS = Path(__file__).parent / "fuzz" / "corpus"
 
 def mutated(text: str, rng: np.random.Generator) -> bytes:
     """One to four changes: a token or a byte replaced, a line repeated, moved or cut, the end torn off."""
+    draw = rng.integers
     data = text
-    for _ in range(rng.integers(1, 5)):
-        kind, at = int(rng.integers(8)), int(rng.integers(max(len(data), 1)))
+    for _ in range(draw(1, 5)):
+        kind, at = int(draw(8)), int(draw(max(len(data), 1)))
         lines = data.split("\n")
-        line = int(rng.integers(len(lines)))
+        line = int(draw(len(lines)))
         if kind <= 2:
             words = re.split('([, "\n])', data)
-            words[int(rng.integers(len(words)))] = str(rng.choice(TOKENS))
+            words[int(draw(len(words)))] = str(rng.choice(TOKENS))
             data = "".join(words)
         elif kind == 3:
             data = data[:at] + chr(int(rng.choice([*range(32, 127), 0, 9, 228, 8232]))) + data[at + 1 :]
@@ -33,15 +34,15 @@ def mutated(text: str, rng: np.random.Generator) -> bytes:
             del lines[line]
             data = "\n".join(lines)
         elif kind == 6:
-            other = int(rng.integers(len(lines)))
+            other = int(draw(len(lines)))
             lines[line], lines[other] = lines[other], lines[line]
             data = "\n".join(lines)
         else:
             data = data[:at] if rng.uniform() < 0.5 else data[at:]
     raw = data.encode("utf-8", "surrogatepass")
     if rng.uniform() < 0.1 and raw:
-        cut = int(rng.integers(len(raw)))
-        raw = raw[:cut] + bytes([int(rng.integers(256))]) + raw[cut + 1 :]
+        cut = int(draw(len(raw)))
+        raw = raw[:cut] + bytes([int(draw(256))]) + raw[cut + 1 :]
     return raw
 
 

@@ -185,8 +185,8 @@ def test_motion_capture_and_radios_of_a_public_bag():
     ranges of radios that have no delays calibrated, 0.39 m too long in the median."""
     highlevel = pytest.importorskip("rosbags.highlevel")
     folder = measured("tiers_ros2")
-    log = read_log(folder)
-    assert sorted(log.recording.ids) == [f"turtlebot{k}" for k in range(1, 8)]
+    recording = read_log(folder).recording
+    assert sorted(recording.ids) == [f"turtlebot{k}" for k in range(1, 8)]
     raw: dict[str, list[tuple[float, ...]]] = {}
     store = importlib.import_module("rosbags.typesys")
     with highlevel.AnyReader([folder], default_typestore=store.get_typestore(store.Stores.ROS2_HUMBLE)) as reader:
@@ -195,10 +195,10 @@ def test_motion_capture_and_radios_of_a_public_bag():
             at = m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
             where = m.pose.position if "pose" in c.topic else None
             raw.setdefault(c.topic, []).append((at, m.range) if where is None else (at, where.x, where.y, where.z))
-    way = {name: np.array(raw[f"/vrpn_client_node/{name}/pose"]) for name in log.recording.ids}
+    way = {name: np.array(raw[f"/vrpn_client_node/{name}/pose"]) for name in recording.ids}
     one = way["turtlebot1"]
-    k = log.recording.ids.index("turtlebot1")
-    near = np.array([np.abs(one[:, 1:] - fix).sum(axis=1).min() for fix in log.recording.gnss[0, 100:200, k]])
+    k = recording.ids.index("turtlebot1")
+    near = np.array([np.abs(one[:, 1:] - fix).sum(axis=1).min() for fix in recording.gnss[0, 100:200, k]])
     assert np.nanmax(near) < 1e-5  # a fix is brought to its step
     errors = []
     for topic, rows in raw.items():
@@ -207,11 +207,11 @@ def test_motion_capture_and_radios_of_a_public_bag():
             a, b = (way[f"turtlebot{part[2:]}"] for part in topic.split("/")[3:5])
             gap = [np.interp(t, a[:, 0], a[:, d]) - np.interp(t, b[:, 0], b[:, d]) for d in (1, 2, 3)]
             errors.append(ranges - norm(gap, axis=0))
-    links = log.recording.links
-    ends = log.recording.gnss[0, links.step, links.observer] - log.recording.gnss[0, links.step, links.neighbour]
-    mine = log.recording.relative[0, :, 0] - norm(ends, axis=1)
+    links = recording.links
+    ends = recording.gnss[0, links.step, links.observer] - recording.gnss[0, links.step, links.neighbour]
+    mine = recording.relative[0, :, 0] - norm(ends, axis=1)
     assert np.nanmedian(mine) == pytest.approx(np.median(np.concatenate(errors)), abs=0.01)
-    assert np.isfinite(log.recording.relative[0, :, 0]).sum() > 0.95 * sum(map(len, errors))
+    assert np.isfinite(recording.relative[0, :, 0]).sum() > 0.95 * sum(map(len, errors))
 
 
 def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):

@@ -8,17 +8,7 @@ from conftest import refused
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import solve_discrete_are
 
-from coopoc import (
-    V2X,
-    Fleet,
-    Sensors,
-    bound_rt_le,
-    load_fleet,
-    nees,
-    observe,
-    posterior_bound,
-    rt_le,
-)
+from coopoc import V2X, Fleet, Sensors, bound_rt_le, load_fleet, nees, observe, posterior_bound, rt_le
 from coopoc.methods.cooperative_filter import AS_STATED, CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.body_frames import gauss_markov

@@ -132,11 +132,7 @@ def test_nothing_is_noted_of_clean_vehicles():
     """At most 1 % of 480 vehicles, each alone and with neighbours; the fixed draws have none."""
     for seed in range(10):
         recording = observe(formation_fleet(6, 600), Sensors.paper_scenario2(), V2X(3), runs=2, seed=seed)
-        for method in (
-            Kalman(),
-            JointFilter(),
-            METHODS["split-ci"]("nominal"),
-        ):
+        for method in (Kalman(), JointFilter(), METHODS["split-ci"]("nominal")):
             notes = method(recording, range(6)).notes
             assert not [n for n in notes if "far from" in n or "contradicted" in n], (method.name, notes)
 

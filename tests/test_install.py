@@ -89,10 +89,7 @@ for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "ru
     except SystemExit as end:
         assert end.code == 2, (words, end.code)
 """
-    done = ran(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-    )
+    done = ran([sys.executable, "-c", code], cwd=tmp_path)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert "SOLVED" in done.stdout
     assert "fedkalmannet" in done.stdout

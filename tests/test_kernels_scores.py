@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.linalg import norm, solve
 from numpy.testing import assert_allclose
 
 from coopoc import V2X, JointFilter, Kalman, Sensors, observe
@@ -18,8 +19,8 @@ def track(crossing):
 
 def test_errors_and_nees_are_numpys(track, crossing):
     gap = track.x - crossing.position[:, [0, 5]]
-    assert_allclose(errors(track, crossing), np.linalg.norm(gap, axis=-1), rtol=1e-14)
-    solved = np.linalg.solve(track.covariance, gap[..., None])[..., 0]
+    assert_allclose(errors(track, crossing), norm(gap, axis=-1), rtol=1e-14)
+    solved = solve(track.covariance, gap[..., None])[..., 0]
     assert_allclose(nees(track, crossing), (gap * solved).sum(axis=-1), rtol=1e-9)
 
 
@@ -39,5 +40,5 @@ def test_a_start_that_is_known_has_no_nees(crossing):
     assert np.isnan(found[:, 0]).all()
     assert np.isfinite(found[:, 1:]).all()
     gap = (known.x - crossing.position[:, [0]])[:, 1:]
-    solved = np.linalg.solve(known.covariance[:, 1:], gap[..., None])[..., 0]
+    solved = solve(known.covariance[:, 1:], gap[..., None])[..., 0]
     assert_allclose(found[:, 1:], (gap * solved).sum(axis=-1), rtol=1e-9)

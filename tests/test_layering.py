@@ -37,16 +37,7 @@ def imports(name: str, path: Path) -> Iterator[tuple[str, set[str]]]:
 
 
 ROOMS = {
-    "optimize": [
-        "model",
-        "algebra",
-        "assess",
-        "descent",
-        "starts",
-        "robust",
-        "convex",
-        "backends",
-    ],
+    "optimize": ["model", "algebra", "assess", "descent", "starts", "robust", "convex", "backends"],
     "kernels": ["compiling", "graphs", "stars", "poses"],
 }
 """Folders of a floor, each of which imports those before it only; modules beside them stand above or below all."""

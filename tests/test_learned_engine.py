@@ -9,6 +9,7 @@ from conftest import refused
 from numba import njit
 from numpy.testing import assert_allclose
 from torch import Tensor
+from torch.testing import assert_close
 
 from coopoc.learned import GainNet
 from coopoc.learned.engine.backward import Moments, Update
@@ -88,7 +89,7 @@ def test_float32_agrees_with_the_reference(models, lanes, steps):
     nets = [GainNet(seed=s) for s in range(models)]
     data = batch(models, lanes, steps, torch.float32, 0.1)
     found, mine, expected, theirs = gradients(nets, data, 0.1)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5 * expected.abs().max().item())
+    assert_close(found, expected, rtol=1e-5, atol=1e-5 * expected.abs().max().item())
     wide = Batch(data.gnss.double(), data.velocity.double(), data.truth.double(), data.x0.double(), 0.1)
     exact = gradients([copy.deepcopy(net).double() for net in nets], wide, 0.1)[3]
     far, near = (mine - exact).norm(dim=1), (theirs - exact).norm(dim=1)
@@ -99,8 +100,8 @@ def test_float64_agrees_with_the_reference_with_gaps_and_variable_dt():
     nets = [GainNet(4, 2, seed=s).double() for s in range(2)]
     dt = torch.linspace(0.05, 0.3, 60, dtype=torch.float64)
     found, mine, expected, theirs = gradients(nets, batch(2, 9, 60, gaps=0.4), dt)
-    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
+    assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("descend", [GainNet.descend, Gain.descend], ids=["whole", "by parts"])
@@ -119,12 +120,12 @@ def test_descent_is_that_of_torch(descend):
         for row, net in leaves.items():
             gnss, velocity, truth = (part[:, row].transpose(0, 1) for part in data[:3])
             loss = (Recurrent.forward(net, gnss, velocity, data.x0[row], 0.1) - truth).square().sum(-1).mean()
-            torch.testing.assert_close(outcome.losses[row], loss.item(), rtol=1e-10, atol=1e-12)
+            assert_close(outcome.losses[row], loss.item(), rtol=1e-10, atol=1e-12)
             optimisers[row].zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), 0.5)
             optimisers[row].step()
-    torch.testing.assert_close(theta[[0, 3]], flatten([*leaves.values()]), rtol=1e-8, atol=1e-10)
+    assert_close(theta[[0, 3]], flatten([*leaves.values()]), rtol=1e-8, atol=1e-10)
     assert torch.equal(theta[1:3], started[1:3])
 
 
@@ -135,7 +136,7 @@ def test_gradients_of_inputs_and_weights_go_through_the_reference():
     assert float(grad(gnss).abs().sum()) > 0
     theta = flatten([net])
     (by_torch,) = torch.autograd.grad(net.losses(leaf := theta.clone().requires_grad_(), data).sum() / 2, leaf)
-    torch.testing.assert_close(by_torch, net.loss_and_gradient(theta, data)[1])
+    assert_close(by_torch, net.loss_and_gradient(theta, data)[1])
 
 
 def test_what_does_not_fit_is_named():

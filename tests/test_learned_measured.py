@@ -14,14 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopoc as co
 from coopoc import V2X, Fleet, Recording, Sensors, observe
 from coopoc.cli import main
-from coopoc.learned import (
-    GainNet,
-    NoiseParameters,
-    Schedule,
-    Segments,
-    load_method,
-    train_all,
-)
+from coopoc.learned import GainNet, NoiseParameters, Schedule, Segments, load_method, train_all
 from coopoc.learned.checkpoint import read_card
 from coopoc.learned.nets.gain import flatten
 from coopoc.learned.recipes import RECIPES
@@ -174,9 +167,7 @@ def test_a_log_trains_and_its_rest_scores(log, tmp_path, capsys):
     assert y / x == pytest.approx(3.0, rel=0.25)
     settings = {"data": f"{log}?since=50", "clients": f"{log}?until=50", "weights": weights, "max_neighbours": "0"}
     found = co.run_study(
-        "side_by_side",
-        tmp_path,
-        settings=settings | {"method": "gnss,kalman,okf", "noise_model": "fitted"},
+        "side_by_side", tmp_path, settings=settings | {"method": "gnss,kalman,okf", "noise_model": "fitted"}
     )
     level = found.frame.groupby("method")["rt_le_m"].mean()
     assert file.stat().st_mtime_ns == made

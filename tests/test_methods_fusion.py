@@ -18,12 +18,7 @@ from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()
 SPLIT = CovarianceIntersection(split=True, name="split-ci")
-FILTERS = [
-    CovarianceIntersection(),
-    SPLIT,
-    CovarianceIntersection("identity"),
-    replace(SPLIT, noise_model="identity"),
-]
+FILTERS = [CovarianceIntersection(), SPLIT, CovarianceIntersection("identity"), replace(SPLIT, noise_model="identity")]
 SNAPSHOTS = [QCQPRelaxation(), QCQPRelaxation("identity")]
 METHODS = [*FILTERS, *SNAPSHOTS]
 

@@ -270,10 +270,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "NoiseModel.process_variance": (co.NoiseModel.nominal(NOISE).process_variance, {"recording": SEEN}),
     "NoiseModel.fix_scale": (co.NoiseModel.nominal(NOISE).fix_scale, {"recording": SEEN}),
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
-    "Problem": (
-        least_squares,
-        {"nodes": AB, "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])},
-    ),
+    "Problem": (least_squares, {"nodes": AB, "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])}),
     "solve": (lambda **given: co.solve(**given).x, {"problem": PAIR, "backend": "gauss-newton"}),
     "incremental": (lambda **given: co.incremental(**given)[0], {"problem": PAIR, "lag": 2, "params": None}),
     "pose": (co.pose, {"position": np.zeros((4, 2)), "turn": np.full(4, 0.7)}),
@@ -403,14 +400,7 @@ def test_arrays_of_the_wrong_kind_are_refused():
 
 
 def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path):
-    for read in (
-        co.read_graph,
-        load_graph,
-        read_g2o,
-        read_pyfg,
-        co.load_fleet,
-        co.read_log,
-    ):
+    for read in (co.read_graph, load_graph, read_g2o, read_pyfg, co.load_fleet, co.read_log):
         for value in ALL:
             ours(partial(read, value), f"path={shown(value, 40)}")
     for value in (None, 1, [], b"x"):

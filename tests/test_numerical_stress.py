@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import textbook
 from logs import NOISE, drive
+from numpy.linalg import eigvalsh, norm
 from numpy.random import default_rng
 
 import coopoc as co
@@ -90,7 +91,7 @@ def test_estimates_stay_sane_where_digits_are_few(fleet, sensors):
         if track.covariance is not None:
             size = np.abs(track.covariance).max(axis=(-1, -2), keepdims=True)
             assert np.abs(track.covariance - np.swapaxes(track.covariance, -1, -2)).max() <= 1e-9 * size.max(), name
-            assert (np.linalg.eigvalsh(track.covariance / size) > -1e-9).all(), name
+            assert (eigvalsh(track.covariance / size) > -1e-9).all(), name
 
 
 def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_the_track_says_so():
@@ -98,7 +99,7 @@ def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_t
     fleet, sensors = in_line(4, 10.0), co.Sensors(gnss_std=(800.0, 2.0, 0.02), azimuth_std=1.5e-6, inclination_std=6e-6)
     track = co.JointFilter()(observed(fleet, sensors), [0])
     assert any("at least 0.015 m and rad" in note for note in track.notes)
-    assert (np.linalg.eigvalsh(track.covariance) > 0.0).all()
+    assert (eigvalsh(track.covariance) > 0.0).all()
     usual = co.JointFilter()(observed(fleet, co.Sensors()), [0])
     assert not usual.notes
 
@@ -137,7 +138,7 @@ def test_the_smoother_descends_where_whole_steps_lead_away():
     )
     recording = observed(fleet, sensors, 6, 13)
     settled = co.BatchSmoother()(recording, [0]).x
-    error = np.linalg.norm(off(settled, fleet), axis=-1)
+    error = norm(off(settled, fleet), axis=-1)
     assert error.max() < 3.0 * np.abs(off(recording.gnss, fleet)).max()
 
 

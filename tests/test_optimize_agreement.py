@@ -18,16 +18,7 @@ from random_graphs import random_graph, star
 from shell import ROOT
 
 from coopoc import V2X, Sensors, load_fleet, observe
-from coopoc.optimize import (
-    Backend,
-    Loss,
-    Problem,
-    Solution,
-    Status,
-    backends,
-    solve,
-    solve_gnc,
-)
+from coopoc.optimize import Backend, Loss, Problem, Solution, Status, backends, solve, solve_gnc
 from coopoc.optimize.backend import require_backend
 from coopoc.optimize.convex.relaxation import shor
 from coopoc.optimize.graph_problems import from_graph

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused
+from numpy.linalg import cholesky, eigvalsh, inv, lstsq
 from numpy.random import default_rng
 from oracles.whitened import whitened
 from random_graphs import AB, PAIR
@@ -80,7 +81,7 @@ def test_a_range_below_the_gate_widens_its_angles(recording):
     """The tangential std in metres is that at min_range, as in the converted covariance (vector_cov)."""
     near = np.array([[0.5, 0.3, 1.5]])
     std = relative_std(near, S2)[0]
-    floor = np.linalg.eigvalsh(vector_cov(near[0], S2.relative_std, S2.min_range))
+    floor = eigvalsh(vector_cov(near[0], S2.relative_std, S2.min_range))
     assert 0.5 * std[2] == pytest.approx(np.sqrt(floor[1]), rel=1e-9)
     assert relative_std(near * [10, 1, 1], S2).shape == (3,)
 
@@ -191,10 +192,10 @@ def test_a_start_is_the_least_squares_of_the_converted_vectors(recording):
             wide[:, nodes[-1]] = np.eye(3)
             if len(nodes) == 2:
                 wide[:, nodes[0]] = -np.eye(3)
-            root = np.linalg.cholesky(np.linalg.inv(own)).T
+            root = cholesky(inv(own)).T
             rows.append(root @ wide.reshape(3, -1))
             goals.append(root @ value)
-    wanted = np.linalg.lstsq(np.concatenate(rows), np.concatenate(goals), rcond=None)[0]
+    wanted = lstsq(np.concatenate(rows), np.concatenate(goals), rcond=None)[0]
     assert initial_guess(problem).ravel() == pytest.approx(wanted, abs=1e-5)
 
 

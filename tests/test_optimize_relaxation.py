@@ -12,6 +12,7 @@ import pytest
 import range_only
 import tightness
 from conftest import measured, refused
+from numpy.linalg import eigvalsh, lstsq
 from numpy.random import default_rng
 from random_graphs import scipys
 from scipy.io import mmread
@@ -191,9 +192,7 @@ def test_the_elimination_is_numpys(make, monkeypatch):
     """C and its products by numpy.linalg.lstsq, eigenvalues by eigh and by Lanczos."""
     form = quadratic(make(0))
     small, A = Reduced(form), form.rows.toarray()
-    rest = A @ np.concatenate(
-        [np.eye(form.bound), -np.linalg.lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]]
-    )
+    rest = A @ np.concatenate([np.eye(form.bound), -lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]])
     C = rest.T @ rest
     X = form.project(default_rng(0).standard_normal((form.bound, form.columns)))
     assert small.matrix == pytest.approx(C, abs=1e-9 * np.abs(C).max())
@@ -201,7 +200,7 @@ def test_the_elimination_is_numpys(make, monkeypatch):
     assert np.square(A @ small.settle(X)).sum() == pytest.approx(np.sum(X * (C @ X)), rel=1e-9)
     L = multipliers(form, X, small.times(X))
     (a,) = small.smallest(L)
-    assert a == pytest.approx(np.linalg.eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
+    assert a == pytest.approx(eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
     monkeypatch.setattr(relaxation, "FORMED_ROWS", 0)
     large = Reduced(form)
     assert large.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
@@ -286,7 +285,7 @@ def test_the_eigenvalue_is_that_of_the_whole_matrix():
                 S[row, row] -= CX[row] @ X[row]
             smallest = certify(problem, solution).smallest_eigenvalue
             tolerance = 1e-9 * np.abs(Q).max()
-            assert (np.linalg.eigvalsh(S)[0] < -tolerance) == (smallest < -tolerance)
+            assert (eigvalsh(S)[0] < -tolerance) == (smallest < -tolerance)
 
 
 def test_the_example_tells_local_from_global(capsys):

@@ -78,11 +78,7 @@ def ranged() -> tuple[Fleet, Recording]:
 
 @pytest.mark.parametrize(
     "method",
-    [
-        JointFilter(),
-        JointFilter(exact=False),
-        CooperativeFilter(priors=AS_STATED),
-    ],
+    [JointFilter(), JointFilter(exact=False), CooperativeFilter(priors=AS_STATED)],
     ids=lambda method: f"{method.name}-{getattr(method, 'exact', '')}",
 )
 def test_a_range_to_a_neighbour_whose_first_fix_comes_late_does_no_harm(method):

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from conftest import refused, with_masts
 from logs import noisy
+from numpy.linalg import inv, norm
 
 import coopoc as co
 from coopoc.evaluate.metrics import nees_band, share_of_average
@@ -55,7 +56,7 @@ def test_a_fleet_is_consistent_where_noise_is_a_share_of_the_speed():
     fleet = convoy(4, 200)
     track = co.PoseFilter("fleet")(observed(fleet, replace(WHITE, range_std=0.1, azimuth_std=0.01), 80), range(4))
     error = (track.x - fleet.position)[:, 20:, :, :2]
-    inverse = np.linalg.inv(track.covariance[:, 20:, :, :2, :2])
+    inverse = inv(track.covariance[:, 20:, :, :2, :2])
     assert 1.8 < np.einsum("...i,...ij,...j->...", error, inverse, error).mean() < 2.2
     assert abs(error.mean(axis=(0, 1, 2))).max() < 0.05
 
@@ -171,7 +172,7 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
     log = co.read_log(tmp_path, frame="body")
     rec, own = log.recording, [log.recording.ids.index(name) for name in "abc"]
     begin = co.pose_start(rec)
-    assert np.linalg.norm(begin[0, own, :2] - log.truth.position[0, own, :2], axis=1).max() < 1.0
+    assert norm(begin[0, own, :2] - log.truth.position[0, own, :2], axis=1).max() < 1.0
     assert np.abs(wrap(begin[0, own, 3] - log.truth.heading[0, own])).max() < 0.15
     track = co.PoseFilter(begin=begin)(rec, own)
     assert co.rt_le(track, log.truth).max() < 0.1
@@ -189,7 +190,7 @@ def test_first_poses_come_from_ranges_alone():
     relative, fixes = np.where(np.arange(3) == 0, seen.relative, np.nan), np.array(seen.gnss)
     fixes[:, :, :2] = np.nan
     off = co.pose_start(replace(seen, gnss=fixes, relative=relative))[:, :2] - np.c_[fleet.position[0, :2], [0.0, 0.19]]
-    assert np.median(np.linalg.norm(off[..., :2], axis=-1)) < 1.2
+    assert np.median(norm(off[..., :2], axis=-1)) < 1.2
     assert np.abs(off[..., 3]).max() < 0.1
 
 

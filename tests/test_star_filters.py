@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import holed, slow_fixes, standing, textbook, without
 from filterpy.kalman import KalmanFilter
+from numpy.linalg import eigvalsh, inv
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
 from scipy.linalg import block_diag
@@ -199,8 +200,8 @@ def test_linear_filters_equal_filterpy(formation, laplacian):
         if t:
             peer.update(z, R=noise)
         else:
-            weight, at = peer.H.T @ np.linalg.inv(noise), np.append(fixes[:3], fixes[:3] + vectors)
-            peer.P = np.linalg.inv(n / 1e6 + weight @ peer.H)
+            weight, at = peer.H.T @ inv(noise), np.append(fixes[:3], fixes[:3] + vectors)
+            peer.P = inv(n / 1e6 + weight @ peer.H)
             peer.x = at + peer.P @ weight @ (z - peer.H @ at)
         assert track.x[1, t, 0] == pytest.approx(peer.x[:3], abs=1e-9)
         assert track.covariance[1, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
@@ -222,4 +223,4 @@ def test_a_range_of_almost_nothing_leaves_covariances_positive():
     relative = seen.relative.copy()
     relative[:, ::7, 0] /= 1e5
     near = replace(seen, relative=relative)
-    assert np.linalg.eigvalsh(JointFilter()(near, [8]).covariance).min() > 0
+    assert eigvalsh(JointFilter()(near, [8]).covariance).min() > 0

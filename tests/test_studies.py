@@ -78,11 +78,7 @@ def test_neighbours_runs_without_any_training(tmp_path):
 @pytest.mark.parametrize("rate", [10.0, 2.0])
 def test_the_bound_receives_what_the_channel_sends(rate):
     """As many bytes as the joint filter counts by itself, at every step and at a fifth of them."""
-    p = {
-        **study("neighbours", runs=1, egos="1").settings,
-        "max_neighbours": 4,
-        "rate_hz": rate,
-    }
+    p = {**study("neighbours", runs=1, egos="1").settings, "max_neighbours": 4, "rate_hz": rate}
     (bound,) = lineup.cell({**p, "method": "bound", "noise_model": "bound"})
     (joint,) = lineup.cell({**p, "method": "joint", "noise_model": "nominal"})
     assert bound["bytes_per_second"] == pytest.approx(joint["bytes_per_second"], rel=0.1)
@@ -179,12 +175,7 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10):
     score: dict[str, list[float]] = {}
     for k in (1, 4, 10):
         seen = co.observe(town10, sensors, co.V2X(max_neighbours=k), runs=8, observers=egos)
-        for method in (
-            co.GNSS(),
-            load_method("fedkalmannet"),
-            co.LKFSA("identity"),
-            co.JointFilter(),
-        ):
+        for method in (co.GNSS(), load_method("fedkalmannet"), co.LKFSA("identity"), co.JointFilter()):
             each = rt_le(method(seen, egos), town10)
             assert (each < 7.0).all()
             score.setdefault(method.name, []).append(float(each.mean()))

@@ -27,9 +27,7 @@ def test_side_by_side_takes_any_methods_and_conditions(tmp_path, short_town):
     caption = (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
     assert "With latency_s 0.2, common_share 0.5." in caption
     mild = run_study(
-        "side_by_side",
-        tmp_path / "mild",
-        settings={**harsh, "method": "joint", "latency_s": None, "common_share": 0.0},
+        "side_by_side", tmp_path / "mild", settings={**harsh, "method": "joint", "latency_s": None, "common_share": 0.0}
     )
     where = {"method": "joint", "max_neighbours": 4}
     assert results.values("rt_le_m", where).mean() > mild.values("rt_le_m", where).mean()

@@ -86,12 +86,7 @@ def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
     mount = "mount -t tmpfs -o size=10m tmpfs disk"
     if subprocess.run([*shell, mount], cwd=tmp_path, capture_output=True, timeout=20).returncode:
         pytest.skip("this system lets nobody mount a disk of their own")
-    done = ran(
-        [*shell, f"{mount}\n{script}"],
-        cwd=tmp_path,
-        env={**ENV, "RUN": " ".join(COMMAND)},
-        timeout=120,
-    )
+    done = ran([*shell, f"{mount}\n{script}"], cwd=tmp_path, env={**ENV, "RUN": " ".join(COMMAND)}, timeout=120)
     return (done.stdout + done.stderr).splitlines()
 
 

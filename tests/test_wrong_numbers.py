@@ -320,9 +320,7 @@ def test_messages_that_are_all_lost_are_noted(given):
 
 
 @pytest.mark.parametrize("gap", [(0.0, 0.0, 10.0), (1e-9, 0.0, 0.0)], ids=["above", "in one place"])
-def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(
-    gap,
-):
+def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(gap):
     """The azimuth of what is straight above says nothing: with it the joint filter had 0.67 m, alone 0.54 m."""
     above = drive(gap)
     seen = co.observe(above, S, co.V2X(1, 60.0), runs=10, seed=1)

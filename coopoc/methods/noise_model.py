@@ -1,7 +1,7 @@
 """NoiseModel: the noise that a filter assumes. It is an axis of every study, never a hidden default."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,12 @@ from ..world.links import vector_cov
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 
+OFFSET_COUNT, OFFSET_PARTS, OFFSET_STDS = 100, 10, 2.5
+"""Ranges of a pair, in parts of a drive, and standard deviations of the means of these that an offset has."""
+OFFSETS = (
+    'ranges of {} and {} contradict fixes by an offset, which only PoseFilter("fleet") (frame="body") has as a state: '
+    "coopoc data check prints offset="
+)
 HELD_OUT = 8
 """Blocks of time on which fitted noise is tested."""
 
@@ -284,7 +290,8 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
     directed = measured[np.isfinite(measured[:, 1])]
     if not len(measured):
         return noise_model
-    far, notes = float(np.median((directed if len(directed) else measured)[:, 0])), noise_model.notes
+    far = float(np.median((directed if len(directed) else measured)[:, 0]))
+    notes = (*noise_model.notes, *_offsets(recording, noise))
     if noise.range_std > far / 2:
         actual = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
         return replace(noise_model, notes=(*notes, f"{actual}: none is negative, so that their errors have a mean"))
@@ -302,7 +309,7 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
             f"fixes of {np.sqrt(fix):.2g} m, {often:.0f} ranges of a pair to a fix and no azimuth",
         )
     if arc <= noise.range_std:
-        return noise_model
+        return replace(noise_model, notes=notes)
     std = float(np.hypot(arc, noise.range_std))
     text = (
         f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m, by the whole drive (not causal): "
@@ -311,23 +318,39 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
     return replace(noise_model, sensors=replace(noise, range_std=std), notes=(*notes, text))
 
 
+def _offsets(recording: Recording, noise: Sensors) -> Iterator[str]:
+    """A note on each pair of a log whose ranges are off by fixes of both at one step, by more than these scatter:
+    methods of positions have no state for that."""
+    links, ranges = recording.links, recording.relative[0, :, 0]
+    ends = np.sort([links.observer, links.neighbour], axis=0)
+    one, other = recording.gnss[0][links.step, ends]
+    off = ranges - np.linalg.norm(other - one, axis=1)
+    for pair in np.unique(ends, axis=1).T if recording.measured else ():
+        here = (pair == ends.T).all(axis=1) & np.isfinite(off)
+        if here.sum() > OFFSET_COUNT:
+            parts = [part.mean() for part in np.array_split(off[here], OFFSET_PARTS)]
+            least = 2.0 * noise.range_std + off[here].var() / ranges[here].mean()
+            if abs(np.mean(parts)) > OFFSET_STDS * np.std(parts) + least:
+                yield OFFSETS.format(*(recording.ids[end] for end in pair))
+
+
 def _resolvable(noise_model: NoiseModel) -> NoiseModel:
     """The model with relative noise of at least FINEST and UNEVEN, angles at a distance of 1 m; a note names the
     floor."""
-    if noise_model.sensors is None:
+    if (noise := noise_model.sensors) is None:
         return noise_model
     fix, coarse = (
         max(noise_model.gnss_std),
-        max(noise_model.sensors.relative_std * np.array([1.0, COARSE_DISTANCE, COARSE_DISTANCE])),
+        max(noise.relative_std * np.array([1.0, COARSE_DISTANCE, COARSE_DISTANCE])),
     )
     least = max(FINEST * fix, float(np.sqrt(UNEVEN * fix * min(fix, coarse))))
-    if min(noise_model.sensors.relative_std) >= least:
+    if min(noise.relative_std) >= least:
         return noise_model
     names = ("range_std", "azimuth_std", "inclination_std")
-    raised = {name: max(getattr(noise_model.sensors, name), min(least, np.pi)) for name in names}
+    raised = {name: max(getattr(noise, name), min(least, np.pi)) for name in names}
     beside = f"finer ones beside a fix of {max(noise_model.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
-    return replace(noise_model, sensors=replace(noise_model.sensors, **raised), notes=(*noise_model.notes, note))
+    return replace(noise_model, sensors=replace(noise, **raised), notes=(*noise_model.notes, note))
 
 
 def check_std(made: Any, field: str, least: float = TINY) -> None:

@@ -221,7 +221,8 @@ def _challenged(
     system, record = sparse(problem), first.extras.get("record")
     if record is None:
         record = arrive(system, np.asarray(problem.x0), FIRST_STEPS, RACE_TOLERANCE, smooth=True).record
-    cost = system.cost(first.x)
+    x = first.x
+    cost = system.cost(x)
     if not np.isfinite(cost) or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
     straight, search = smooth(record), problem.search
@@ -229,10 +230,10 @@ def _challenged(
     if near and (whole or search.start):
         return problem, first
     if near:
-        other, won = race(problem, {}, {}, reached=first.x)
+        other, won = race(problem, {}, {}, reached=x)
     else:
-        astray = np.abs(first.x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(first.x, axis=0).max()
-        other = _measured(problem, first.x, bool(not whole and (astray or not straight)))
+        astray = np.abs(x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(x, axis=0).max()
+        other = _measured(problem, x, bool(not whole and (astray or not straight)))
         won = other.search
     saved = cost - (least := system.cost(np.asarray(other.x0)))
     if higher(cost, least) and (not near or saved > RIVAL_COST):

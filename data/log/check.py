@@ -26,6 +26,7 @@ from .estimates import (
     MAY,
     OUTLYING,
     PERHAPS,
+    SURE_CLOCK_ERRORS,
     SURE_ERRORS,
     TENTHS,
     against_truth,
@@ -253,18 +254,23 @@ def _of_rows(c: Check) -> Iterator[str]:
         yield summary.unread
 
 
-def _of_filters(c: Check, named: Sequence[str]) -> list[str]:
-    """Vehicles whose filter errs by more than it states, or misses fixes so, and no sentence says why."""
-    return [
-        f"{row['vehicle']}: its {row['misses']} by {row['per_std']:.1f} times its standard deviation from "
-        f"{row['worst_at_s']:.3g} s on: see the other lines, or the stated noise is wrong."
-        for row in sorted(c.vehicles, key=lambda row: -row["per_std"])
-        if row["per_std"] > CONFIDENT_RATIO
-        and (
-            row["misses"] == "filter errs"
-            or not any(one.startswith(f"{row['vehicle']}: ") and MAY not in one for one in named)
+def _of_filters(c: Check, named: Sequence[str]) -> Iterator[str]:
+    """Vehicles whose filter errs by more than it states, or misses fixes so, and no sentence says why; and whether all
+    do at once."""
+    explained = {one.partition(": ")[0] for one in named if MAY not in one}
+    rows = [row for row in sorted(c.vehicles, key=lambda row: -row["per_std"]) if row["per_std"] > CONFIDENT_RATIO]
+    begins = [row["worst_at_s"] for row in rows]
+    for row in rows:
+        if row["misses"] == "filter errs" or row["vehicle"] not in explained:
+            yield (
+                f"{row['vehicle']}: its {row['misses']} by {row['per_std']:.1f} times its standard deviation from "
+                f"{row['worst_at_s']:.3g} s on: see the other lines, or the stated noise is wrong."
+            )
+    if len(rows) == len(c.vehicles) > 1 and np.ptp(begins) < 2 * np.ptp(c.world.t) / TENTHS:
+        yield (
+            f"all vehicles at once, from {begins[0]:.3g} s on: was the base station of their fixes lost, or did its "
+            "position or the origin change? Or does all odometry fail?"
         )
-    ]
 
 
 def _of_vehicles(c: Check) -> list[str]:
@@ -366,7 +372,7 @@ def _may(row: Mapping[str, Any], name: str, least: float) -> str:
 
 def _late(c: Check, row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row is late beside the truth."""
-    return _beyond(row, "late_s", max(LEAST_LAG, 0.1 * c.world.dt))
+    return _beyond(row, "late_s", max(LEAST_LAG, 0.1 * c.world.dt), SURE_CLOCK_ERRORS)
 
 
 def _of_clocks(c: Check) -> list[str]:
@@ -467,7 +473,10 @@ def _unseen(c: Check) -> Iterator[str]:
     """What the check could not see, and of whom."""
     every = [row["vehicle"] for row in c.vehicles]
     if c.log.truth is None:
-        yield "errors that all sensors share, and a clock that is wrong for all alike: there is no truth"
+        yield (
+            "errors that all sensors share, a constant shift of all fixes (a base station's, the origin's), and a "
+            "clock that is wrong for all alike: there is no truth"
+        )
     if not every:
         yield "errors of fixes, none of which changes while nothing moves"
     turns = ("turned", LEAST_TURN, "rad, of the direction of the odometry")

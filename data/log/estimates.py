@@ -295,8 +295,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
     unit vector from i to j; where ranges are d s late, u (v_i - v_j) d.
     """
-    links, size = c.world.links, len(c.world.ids)
-    gap, _ = residual_of(c.world, c.x)
+    world = c.world
+    links, size = world.links, len(world.ids)
+    gap, _ = residual_of(world, c.x)
     flat, far = distances(gap)
     which = np.append(np.flatnonzero(~c.still), [size, size + 1])
     eye = np.eye(size)[:, which[:-2]]
@@ -310,7 +311,7 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
         of_range = np.column_stack([along[:, None] * ends, far, rate])
         return np.stack([of_range, np.pad(across[:, None] * ends, ((0, 0), (0, 2)))], axis=1)
 
-    velocity = np.nan_to_num(c.world.velocity[0])
+    velocity = np.nan_to_num(world.velocity[0])
     used = (which < size + 2 * alike) & (which != reference)
     made, then = (used * made_by(each) for each in (velocity, following(c, velocity)))
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
@@ -320,7 +321,7 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     value, error = no_estimate(size + 2)
     value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z)
     measured = np.unique(pairs[:, there])
-    stay = max(noise**2 - c.world.sensors.range_std**2, 0.0) * share(c) / max(len(measured), 1)
+    stay = max(noise**2 - world.sensors.range_std**2, 0.0) * share(c) / max(len(measured), 1)
     varied = pd.DataFrame(x[:, -2:]).groupby(groups).transform("var", ddof=0).mean().clip(1e-12)
     error[size:] = np.hypot(error[size:], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
     error[measured[measured == reference]] = 0.0
@@ -434,17 +435,18 @@ def on_time(c: Check, alike: bool, true: Check) -> Check:
 
 def worst(c: Check, column: int) -> tuple[str, float, float]:
     """What a vehicle's filter misses by over CONFIDENT_RATIO of the deviations that it states: positions of a truth in
-    a tenth of the drive, else fixes, in one or alone, where that is beyond chance; by how many; and from when on, s."""
-    size, t, truth = dimensions(c.world), c.world.t - c.world.t[0], c.log.truth
-    tenths = np.arange(len(t)) * TENTHS // len(t)
-    if truth is not None:
-        square, stated = np.square(c.x - truth.position)[:, column, :size], c.variance[:, column, :size]
+    a tenth of the drive, else fixes, or these the truth, in one or alone, where that is beyond chance; by how many; and
+    from when on, s."""
+    rec, truth = c.world, c.log.truth
+    size, t, squares = dimensions(rec), rec.t - rec.t[0], pd.Series(c.normalised[:, column]).dropna()
+    tenths, fixes = np.arange(len(t)) * TENTHS // len(t), (rec.gnss[0], np.square(rec.fix_scale * rec.sensors.fix_std))
+    for what, x, variance in () if truth is None else (("filter errs", c.x, c.variance), ("fixes are off", *fixes)):
+        square, stated = np.square(x - truth.position)[:, column, :size], variance[:, column, :size]
         there = np.isfinite(square)
         sums = [pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)]
         ratios = (sums[0] / sums[1])[sums[1] > 0.0] ** 0.5
         if ratios.max() > CONFIDENT_RATIO:
-            return "filter errs", float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
-    squares = pd.Series(c.normalised[:, column]).dropna()
+            return what, float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
     parts = squares.groupby(tenths[squares.index])
     square = pd.concat([pd.Series([0.0]), squares, parts.transform("mean")])
     count = np.concatenate([[1], np.ones(len(squares)), parts.transform("size")])

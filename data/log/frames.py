@@ -229,7 +229,7 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
         members: of the log.
         drifts: m^2/s, by which the vehicle that wanders least does, as fixes have shown its velocity.
     """
-    base, used, body, summary, dt = Sensors(), set(rows["kind"]), steps.body, steps.summary, steps.dt
+    base, used, body, assume, dt = Sensors(), set(rows["kind"]), steps.body, steps.summary.assume, steps.dt
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
     rare = _apart(rows, MOTION, dt) ** 0.5  # the error of a motion that is measured seldom lasts until the next
 
@@ -238,7 +238,7 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
         if stated > 0.0:
             return stated
         if used & set(names):
-            summary.assume(UNSTATED, f"{default:.3g} {unit} ({names[0]})")
+            assume(UNSTATED, f"{default:.3g} {unit} ({names[0]})")
         return default
 
     x, y, z = base.gnss_std
@@ -261,30 +261,28 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
         noise["heading_std"] = of(HEADING_STD, "rad", "heading")
     elif derived and "bearing" in used:
         noise["heading_std"] = derived
-        summary.assume(f"{derived:.2g} rad as the noise of derived headings, which rotate bearings")
+        assume(f"{derived:.2g} rad as the noise of derived headings, which rotate bearings")
     if climbs > 0.0:
         noise["climb_std"] = np.sqrt(climbs / dt)
-        summary.assume(
-            f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, estimated from fixes: no vz was logged"
-        )
+        assume(f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, estimated from fixes: no vz was logged")
     ratio, moving = 0.0, [member for member in members if not member.stands]
     if moving and all(member.wander.any() for member in moving):
         floor = max(np.sqrt(drifts / dt), rare * of(base.velocity_floor, "m/s", *MOTION))
-        summary.assume(
+        assume(
             f"{floor:.2g} m/s or more as the noise of velocities from fixes, where no velocity or heading was logged"
         )
-        if len(summary.shown) == len(moving):
+        if len(steps.summary.shown) == len(moving):
             noise["velocity_reading"] = "fixes"
     elif {*MOTION}.isdisjoint(square.index):
         ratio, floor = base.velocity_std_ratio, base.velocity_floor
-        summary.assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")
+        assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")
     else:
         floor = rare * of(0.0, "m/s", *MOTION)
         if not body and {"speed", "heading"} <= set(square.index):
             heading = float(np.sqrt(square["heading"]))  # whose error, v^2 s_h^2 across, lasts until the next one
             across = (only(rows, "speed")["value"] ** 2).mean() * heading**2 * _apart(rows, ["heading"], dt)
             floor = max(floor, float(np.sqrt((floor**2 + across) / 2)))
-            summary.assume(f"{floor:.2g} m/s as the noise of velocities, with that of the headings that rotate speeds")
+            assume(f"{floor:.2g} m/s as the noise of velocities, with that of the headings that rotate speeds")
     return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
 
 

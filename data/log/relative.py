@@ -244,9 +244,10 @@ def of_measurements(c: Check) -> Iterator[str]:
 def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]]:
     """Who measures whom -> by what that is off where it is for long, though an offset is taken off; in words, with whom
     else it fits; and s by which the observer's clock is ahead if that explains it, else NaN."""
-    links, ids, measured = c.world.links, c.world.ids, c.world.relative[0, :, 0]
+    world = c.world
+    links, ids, measured = world.links, world.ids, world.relative[0, :, 0]
     misfit_of = {}
-    t, names = c.world.t - c.world.t[0], pairs(c, k, True)
+    t, names = world.t - world.t[0], pairs(c, k, True)
     for rows in names.groupby(names).groups.values():
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]
         off, expected = c.relative[rows, k], c.expected[rows, k]
@@ -259,7 +260,7 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
         some = rows[bad[:: len(bad) // MISFITS + 1]]
         steps, lags = links.step[some][:, None], np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
-        then = (steps - np.round(lags / c.world.dt).astype(int)).clip(0, len(c.x) - 1)
+        then = (steps - np.round(lags / world.dt).astype(int)).clip(0, len(c.x) - 1)
         places = np.concatenate([c.x[steps[:, 0]], c.x[then, other]], axis=1)  # of all, and of its own before and later
         far = np.linalg.norm(places - c.x[steps, one], axis=2)
         miss = pd.DataFrame(np.abs(far - measured[some, None])).median().fillna(np.inf)

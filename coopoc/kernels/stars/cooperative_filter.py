@@ -252,10 +252,12 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
         vehicles: (count,) which they are.
         count: of them.
     """
-    slips, other, failure_known = model.slip > 0.0, tries.other, own[MORE] > 0.0 and tries.doubts[PENDING] == KNOWN
+    ego = f.ego
+    doubts = tries.doubts
+    slips, other, failure_known = model.slip > 0.0, tries.other, own[MORE] > 0.0 and doubts[PENDING] == KNOWN
     if not failure_known:
-        tries.doubts[PENDING] = tries.doubts[PENDING] + own[MORE] if own[MORE] > 0.0 else 0.0
-    f.ego[NOW] = f.ego[CORRECTED] = 0.0
+        doubts[PENDING] = doubts[PENDING] + own[MORE] if own[MORE] > 0.0 else 0.0
+    ego[NOW] = ego[CORRECTED] = 0.0
     if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
         copy_filter(f, tries.alone)
     copy(own, tries.first)
@@ -265,25 +267,25 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
         copy(own, tries.own)
         copy_rows(rows, tries.rows)
     attempt(f, model, own, rows, vehicles, count)
-    fails = tries.doubts[PENDING] > 0.0
+    fails = doubts[PENDING] > 0.0
     if slips and surprised(f, fails or failure_known):
         other.ego[NOW] = 1.0
         if other.ego[LEFT + 3] >= NOT_REMEMBERED_M2 or other.ego[SLIPPED] <= MAY_SLIP:
             remember_place(other, hidden(other, tries.own))
         if fails or failure_known:
-            corrected_motion(other, tries.own, tries.own[MORE] if failure_known else tries.doubts[PENDING])
+            corrected_motion(other, tries.own, tries.own[MORE] if failure_known else doubts[PENDING])
         attempt(other, model, tries.own, tries.rows, vehicles, count)
         probably = chance(other, f, own[DT], fails, failure_known)
         if probably >= 0.5:
             copy_filter(other, f)
-            tries.doubts[PENDING] = KNOWN if fails else tries.doubts[PENDING]
+            doubts[PENDING] = KNOWN if fails else doubts[PENDING]
         elif failure_known and not heard(f, True):
-            tries.doubts[PENDING] = own[MORE]
-        f.ego[SLIPPED] = probably
-    elif f.ego[NUMBERS] > 0.0:
-        f.ego[SLIPPED] = 0.0
+            doubts[PENDING] = own[MORE]
+        ego[SLIPPED] = probably
+    elif ego[NUMBERS] > 0.0:
+        ego[SLIPPED] = 0.0
     else:
-        f.ego[SLIPPED] *= math.exp(-own[DT] / SLIP_DURATION_S)
+        ego[SLIPPED] *= math.exp(-own[DT] / SLIP_DURATION_S)
     remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
@@ -294,6 +296,7 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
 @inner
 def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints, count: int) -> None:
     """A step of the ego alone, whose answer counts where something is wrong with its star."""
+    ego = f.ego
     alone, doubts, own = tries.alone, tries.doubts, tries.first
     alone.ego[NOW] = alone.ego[CORRECTED] = 0.0
     remember_speed(alone, own)
@@ -306,9 +309,9 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
         keep = math.exp(-own[DT] / STAR_MEMORY_S)
         doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, model, own) - gap_to_fix(alone, model, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
-        answers = vector_at(alone.ego, ANSWER // 3), vector_at(f.ego, ANSWER // 3)
+        answers = vector_at(alone.ego, ANSWER // 3), vector_at(ego, ANSWER // 3)
         doubts[ALIKE] = keep * doubts[ALIKE] + speak_for(f, model, own, rows, count, *answers)
-        loudest = max(f.ego[LEVEL], f.ego[LEVEL + 1], f.ego[LEVEL + 2])
+        loudest = max(ego[LEVEL], ego[LEVEL + 1], ego[LEVEL + 2])
         if (
             (loudest > LOUDEST_NOISE or doubts[ALIKE] > AGAINST)
             and doubts[COUNTED] > LEAST_COUNTED
@@ -317,56 +320,58 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
             copy_filter(alone, f)
             doubts[EXCESS] = doubts[COUNTED] = doubts[ALIKE] = 0.0
             doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
-    f.ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
+    ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
     if doubts[ALONE_FOR] > 0.0:
         for i in range(12):
-            f.ego[ANSWER + i] = alone.ego[ANSWER + i]
+            ego[ANSWER + i] = alone.ego[ANSWER + i]
 
 
 @inner
 def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Predict and update, and count what that says of a slip."""
-    f.ego[LIKELY] = f.ego[NUMBERS] = f.ego[SQUARES] = 0.0
+    who = f.who
+    ego = f.ego
+    ego[LIKELY] = ego[NUMBERS] = ego[SQUARES] = 0.0
     leave(f, model, own, rows, vehicles, count)
     scale_motion_noise(f, own, rows, vehicles, count)
-    f.ego[SPAN] = own[DT]
-    f.ego[SINCE_FIX] += own[DT]
-    trusted = f.status[f.who[0, VEHICLE], TRUSTED] > 0.0
-    if f.who[0, REJECTED] == 0 and trusted:
-        f.ego[AGREED] += own[DT]
-    elif f.ego[AGREED] < ESTABLISHED or not trusted:
+    ego[SPAN] = own[DT]
+    ego[SINCE_FIX] += own[DT]
+    trusted = f.status[who[0, VEHICLE], TRUSTED] > 0.0
+    if who[0, REJECTED] == 0 and trusted:
+        ego[AGREED] += own[DT]
+    elif ego[AGREED] < ESTABLISHED or not trusted:
         # faster, so that a start of 10 s that was wrong is left 10 s later
-        f.ego[AGREED] = max(min(f.ego[AGREED], ESTABLISHED) - 1.5 * own[DT], 0.0)
-    if f.ego[STEPS] > 0:
-        f.ego[CLOCK] += own[DT]
-    replace_implausible_velocity(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
-    if f.ego[STEPS] > f.member[0, JOINED]:
+        ego[AGREED] = max(min(ego[AGREED], ESTABLISHED) - 1.5 * own[DT], 0.0)
+    if ego[STEPS] > 0:
+        ego[CLOCK] += own[DT]
+    replace_implausible_velocity(f, model, who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
+    if ego[STEPS] > f.member[0, JOINED]:
         predict(f, model, own)
     moved(f, own)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
             join(f, model, rows, vehicles[i], i)
-    for k in range(len(f.who)):
+    for k in range(len(who)):
         for c in range(4):
             f.member[k, OUT + c] = math.nan
     add_fix(f, model, own, rows, count)
     members = locate(f)
     for i in range(members):
-        k = f.who[i, ORDER]
-        new = f.member[k, EXTRA_VARIANCE] > 0.0 and rows[f.who[k, INPUT], AGE] >= 0.0
-        if not (new and model.fix_gate > 0.0 and measured_whole(rows, f.who[k, INPUT])):
+        k = who[i, ORDER]
+        new = f.member[k, EXTRA_VARIANCE] > 0.0 and rows[who[k, INPUT], AGE] >= 0.0
+        if not (new and model.fix_gate > 0.0 and measured_whole(rows, who[k, INPUT])):
             receive(f, model, rows, k)
         goes_on(f, rows, k)
     locate(f)
     measure(f, model, rows, members)
     for i in range(members):
-        receive(f, model, rows, f.who[i, ORDER])
-        goes_on(f, rows, f.who[i, ORDER])
+        receive(f, model, rows, who[i, ORDER])
+        goes_on(f, rows, who[i, ORDER])
     if model.fix_gate > 0.0:
         trust(f, model)
         doubt_ego(f, model)
     locate(f)
-    f.ego[STEPS] += 1
+    ego[STEPS] += 1
     corrected(f)
     adapt(f, model)
 
@@ -374,18 +379,19 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
 @part
 def locate(f: Filter) -> int:
     """Where the members are now, and, nearest first, which there are; how many."""
+    who = f.who
     g, members = f.g, 0
-    for k in range(len(f.who)):
-        if f.who[k, VEHICLE] < 0:
+    for k in range(len(who)):
+        if who[k, VEHICLE] < 0:
             continue
         for c in range(3):
             f.member[k, AT + c] = g.x[3 * g.block[k, PLACE] + c] + f.member[k, WAY + c]
         i = members
-        while i > 0 and gap2(f, f.who[i - 1, ORDER]) > gap2(f, k):
-            f.who[i, ORDER] = f.who[i - 1, ORDER]
+        while i > 0 and gap2(f, who[i - 1, ORDER]) > gap2(f, k):
+            who[i, ORDER] = who[i - 1, ORDER]
             i -= 1
         if k > 0:
-            f.who[i, ORDER] = k
+            who[i, ORDER] = k
             members += 1
     return members
 
@@ -422,10 +428,11 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
 @part
 def remember_place(f: Filter, more: float) -> None:
     """Remember where the ego is, before fixes lead it away; they may have done so already, with that variance m^2."""
+    ego = f.ego
     for c in range(3):
-        f.ego[LEFT + c] = f.g.x[c]
-    f.ego[LEFT + 3] = (ego_variance(f) + more) / 3.0
-    f.ego[LEFT + 4] = f.ego[LEFT + 5] = f.ego[LEFT + 6] = 0.0
+        ego[LEFT + c] = f.g.x[c]
+    ego[LEFT + 3] = (ego_variance(f) + more) / 3.0
+    ego[LEFT + 4] = ego[LEFT + 5] = ego[LEFT + 6] = 0.0
 
 
 @inside
@@ -482,19 +489,20 @@ def measure(f: Filter, model: Model, rows: Floats, members: int) -> None:
 @inside
 def weigh(f: Filter, model: Model, rows: Floats, k: int) -> None:
     """Update by what is measured of member k."""
+    member = f.member
     g, h = f.g, f.h
     if not relate(f, model, rows, k):
         return
-    if f.member[k, EXTRA_VARIANCE] > 0.0:
-        insert_from_measurement(g, h, k, f.member[k, EXTRA_VARIANCE])
-        f.member[k, EXTRA_VARIANCE] = f.member[k, OUT] = f.member[k, OUT + 1] = f.member[k, OUT + 2] = 0.0
+    if member[k, EXTRA_VARIANCE] > 0.0:
+        insert_from_measurement(g, h, k, member[k, EXTRA_VARIANCE])
+        member[k, EXTRA_VARIANCE] = member[k, OUT] = member[k, OUT + 1] = member[k, OUT + 2] = 0.0
         return
     innovate(g, h)
     score(f, h, GATE, False)
     correct(g, h, 1.0)
     for c in range(3):
         if h.block[MEASURED + c]:
-            f.member[k, OUT + c] = h.three[Q + c]
+            member[k, OUT + c] = h.three[Q + c]
             learn_relative(f, c)
             f.who[k, HITS + c] = f.who[k, HITS + c] + 1 if 0.0 < model.gate < h.three[Q + c] else 0
 

@@ -74,19 +74,20 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
 
     A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
     """
-    for k in range(len(f.who)):
-        f.who[k, INPUT] = ABSENT
+    who = f.who
+    for k in range(len(who)):
+        who[k, INPUT] = ABSENT
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
-            f.who[f.slot[vehicles[i]], INPUT] = i
+            who[f.slot[vehicles[i]], INPUT] = i
     outvoted = model.fix_gate > 0.0 and is_outvoted(f, model, own, rows, count)
     if outvoted:
-        set_trust(f, f.who[0, VEHICLE], 1.0, model.own)
+        set_trust(f, who[0, VEHICLE], 1.0, model.own)
     again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX])
     again = again and (outvoted or needs_restart(f, own)) and start(f, model, own, rows, count)
-    for k in range(1, len(f.who)):
-        j = f.who[k, VEHICLE]
-        if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
+    for k in range(1, len(who)):
+        j = who[k, VEHICLE]
+        if j < 0 or (who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
         dismiss(f, model, k, outvoted)
 
@@ -189,16 +190,18 @@ def stand(f: Filter, rows: Floats, k: int) -> None:
 @part
 def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
     """Insert a member where the ego measures it."""
+    member = f.member
+    who = f.who
     g, k = f.g, 1
-    while f.who[k, VEHICLE] >= 0:
+    while who[k, VEHICLE] >= 0:
         k += 1
-    f.who[k, VEHICLE], f.slot[vehicle], f.who[k, INPUT] = vehicle, k, row
-    f.member[k, LOCKED] = 0.0
-    f.member[k, JOINED], f.member[k, EXTRA_VARIANCE], age = f.ego[STEPS], model.flat, max(rows[row, AGE], 0.0)
-    f.member[k, WHEN] = f.ego[CLOCK] - age
+    who[k, VEHICLE], f.slot[vehicle], who[k, INPUT] = vehicle, k, row
+    member[k, LOCKED] = 0.0
+    member[k, JOINED], member[k, EXTRA_VARIANCE], age = f.ego[STEPS], model.flat, max(rows[row, AGE], 0.0)
+    member[k, WHEN] = f.ego[CLOCK] - age
     for c in range(3):
-        f.who[k, HITS + c], f.member[k, WAY + c] = 0, 0.0
-    f.who[k, REJECTED] = 0
+        who[k, HITS + c], member[k, WAY + c] = 0, 0.0
+    who[k, REJECTED] = 0
     first = insert(g, k, PLACE)
     stand(f, rows, k)
     if age > 0.0:

@@ -179,22 +179,23 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
     The mean error that the odometer makes of n fixes since the last message is that of the middle of the way: they are
     used there.
     """
+    member = f.member
     g, j, row, dt = f.g, f.who[k, VEHICLE], f.who[k, INPUT], f.ego[SPAN]
     status, age = f.status[j], rows[row, AGE]
     sent = f.ego[CLOCK] - age
-    if age < 0.0 and f.member[k, WHEN] < f.ego[CLOCK]:  # nothing is known of its motion
-        f.member[k, WHEN] = f.ego[CLOCK]
-        f.member[k, EXTRA_VARIANCE] += model.flat
+    if age < 0.0 and member[k, WHEN] < f.ego[CLOCK]:  # nothing is known of its motion
+        member[k, WHEN] = f.ego[CLOCK]
+        member[k, EXTRA_VARIANCE] += model.flat
         stand(f, rows, k)
     if age < 0.0 or sent <= status[USED] + ROUNDING:
         return
-    gap, again, first = sent - f.member[k, WHEN], status[USED] > -math.inf, 3 * g.block[k, PLACE]
+    gap, again, first = sent - member[k, WHEN], status[USED] > -math.inf, 3 * g.block[k, PLACE]
     steps = max(1.0, math.floor((sent - status[USED]) / dt + 0.5)) if again else 1.0
-    follows = again and abs(f.member[k, WHEN] - status[USED]) <= ROUNDING
+    follows = again and abs(member[k, WHEN] - status[USED]) <= ROUNDING
     for c in range(3):
-        f.member[k, WAY + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c]
+        member[k, WAY + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c]
         status[LAST + 6 + c] = rows[row, ODOMETER + c]
-        rows[row, ODOMETER + c] = f.member[k, WAY + c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
+        rows[row, ODOMETER + c] = member[k, WAY + c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
     replace_implausible_velocity(f, model, j, rows[row], ODOMETER, STEP, 1.0)
     drive(f, model, k, scale(vector_at(rows[row], ODOMETER // 3), gap), gap)
     half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
@@ -202,15 +203,15 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
     if message_rows(f, model, rows, k, sent, steps, again, follows):
         q = innovate(g, f.h)
-        known = again and f.member[k, EXTRA_VARIANCE] == 0.0
+        known = again and member[k, EXTRA_VARIANCE] == 0.0
         if known and status[TRUSTED] > 0.0 and sum(f.h.block[MEASURED:]) == 3:
             learn_fix(f, model, MESSAGES)
-        way = vector_at(f.member[k], WAY // 3)
+        way = vector_at(member[k], WAY // 3)
         use_fix(f, model, k, again, q, True, may_slip(rows[row], TYPICAL, inner_product(way, way)))
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
-    status[USED] = f.member[k, WHEN] = sent
+    status[USED] = member[k, WHEN] = sent
 
 
 @inside
@@ -288,10 +289,12 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         supported: whether nothing speaks against the estimate, and for the fix.
         slip: of `may_slip`.
     """
+    ego = f.ego
+    member = f.member
     g, h, j, used = f.g, f.h, f.who[k, VEHICLE], sum(f.h.block[MEASURED:])
-    if f.member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
-        insert_from_measurement(g, h, k, f.member[k, EXTRA_VARIANCE])
-        f.member[k, EXTRA_VARIANCE] = 0.0
+    if member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
+        insert_from_measurement(g, h, k, member[k, EXTRA_VARIANCE])
+        member[k, EXTRA_VARIANCE] = 0.0
         return 1.0
     judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
@@ -301,10 +304,10 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         elif f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
         set_trust(f, j, 0.0 if supported else 1.0, (TAU**2 if supported else 0.0) + model.own)
-        if k == 0 and f.ego[JUMPED] == 0.0:
-            f.ego[AGREED] = 0.0
+        if k == 0 and ego[JUMPED] == 0.0:
+            ego[AGREED] = 0.0
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
-            f.member[0, LOCKED] = 0.0
+            member[0, LOCKED] = 0.0
             fix_terms(f, 0)
             innovate(g, h)
             correct(g, h, 1.0)
@@ -314,17 +317,17 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
-            own += h.matrix[COV + 4 * c] if judged else f.ego[BARE + c]
-            noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-f.ego[LEVEL + FIXES]))
+            own += h.matrix[COV + 4 * c] if judged else ego[BARE + c]
+            noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-ego[LEVEL + FIXES]))
     share = 1.0
     if model.fix_gate > 0.0:
-        share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
+        share = 1.0 / inflation(q, model.fix_gate, member[k, LOCKED])
         lasts = share < 1.0 and (k == 0 or heard(f, True) > 2)
         share /= 1.0 + f.who[k, REJECTED] if lasts else 1.0
-        f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
-        holds = f.ego[AGREED] >= ESTABLISHED or (f.ego[AGREED] > 0.0 and f.ego[JUMPED] > 0.0)
-        if not judged and holds and f.ego[LEVEL + FIXES] <= LOUDEST_NOISE:
-            f.member[0, LOCKED] = min(f.member[0, LOCKED], MAX_LOCKOUT)
+        member[k, LOCKED] = count(q, model.fix_gate, member[k, LOCKED], own / (own + noise))
+        holds = ego[AGREED] >= ESTABLISHED or (ego[AGREED] > 0.0 and ego[JUMPED] > 0.0)
+        if not judged and holds and ego[LEVEL + FIXES] <= LOUDEST_NOISE:
+            member[0, LOCKED] = min(member[0, LOCKED], MAX_LOCKOUT)
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
     return share
@@ -385,13 +388,14 @@ def trust(f: Filter, model: Model) -> None:
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
+    status = f.status
     g, h = f.g, f.h
     wide, narrow = TAU**2 + model.own, 0.0
     while True:
         best, most = ABSENT, TRUST_LOG_ODDS
         for k in range(len(f.who)):
             j = f.who[k, VEHICLE]
-            if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
+            if j < 0 or status[j, TRUSTED] > 0.0 or (k > 0 and status[j, USED] == -math.inf):
                 continue
             first, own = 3 * g.block[k, ERROR], min(model.own + usual_error(f, k), 0.5 * wide)
             unit = wide * wide / (wide - own)
@@ -400,19 +404,19 @@ def trust(f: Filter, model: Model) -> None:
                 for d in range(3):
                     h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (less if c == d else 0.0)
             q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
-            odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * f.status[j, REVOKED]
+            odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most, narrow = k, odds, less
         if best < 0:
             return
         j = f.who[best, VEHICLE]
-        f.status[j, TRUSTED], f.status[j, COUNT] = 1.0, 0.0
+        status[j, TRUSTED], status[j, COUNT] = 1.0, 0.0
         begin_rows(h)
         add_term(h, g.block[best, ERROR], IDENTITY)
         for c in range(3):
             expect(h, c, 0.0, max(narrow, 1e-6))
-            f.status[j, MEAN + c] = 0.0
+            status[j, MEAN + c] = 0.0
         update(g, h)
         if model.own == 0.0:
             remove(g, best, ERROR)
@@ -422,15 +426,16 @@ def trust(f: Filter, model: Model) -> None:
 def doubt_ego(f: Filter, model: Model) -> None:
     """Where the fixes of most neighbours err by one and the same vector beyond doubt, and none has ever been trusted,
     it is the ego's receiver that errs: the ego goes where they see it, and they join anew."""
-    g, ego, best, most, others = f.g, f.who[0, VEHICLE], ABSENT, 1, heard(f, False)
+    who = f.who
+    g, ego, best, most, others = f.g, who[0, VEHICLE], ABSENT, 1, heard(f, False)
     if others < 2 or f.status[ego, TRUSTED] == 0.0:
         return
     for j in range(len(f.slot)):
         if j != ego and (f.status[j, TRUSTED] > 0.0 or f.status[j, REVOKED] > 0.0):
             return
-    for k in range(1, len(f.who)):
+    for k in range(1, len(who)):
         alike = 0
-        for i in range(1, len(f.who)):
+        for i in range(1, len(who)):
             alike += difference(f, k, k) > WILD and (i == k or difference(f, k, i) < FIX_GATE)
         if alike > most:
             best, most = k, alike
@@ -440,10 +445,10 @@ def doubt_ego(f: Filter, model: Model) -> None:
     for c in range(3):
         spread += (g.p[c, c] + g.p[first + c, first + c] + 2.0 * g.p[c, first + c]) / 3.0
     there = add(vector_at(g.x, 0), vector_at(g.x, first // 3))
-    for k in range(1, len(f.who)):
-        f.who[k, HITS] = k == best or difference(f, best, k) < FIX_GATE
-    for k in range(1, len(f.who)):
-        j, agrees = f.who[k, VEHICLE], f.who[k, HITS] > 0
+    for k in range(1, len(who)):
+        who[k, HITS] = k == best or difference(f, best, k) < FIX_GATE
+    for k in range(1, len(who)):
+        j, agrees = who[k, VEHICLE], who[k, HITS] > 0
         if j >= 0:
             dismiss(f, model, k, False)
             if agrees:
@@ -453,7 +458,7 @@ def doubt_ego(f: Filter, model: Model) -> None:
     widen(g, 0, spread)
     set_trust(f, ego, 0.0, TAU**2 + model.own)
     f.status[ego, REVOKED] += 1.0
-    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], f.who[0, REJECTED] = NOT_REMEMBERED_M2, 0.0, 0.0, 0
+    f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], who[0, REJECTED] = NOT_REMEMBERED_M2, 0.0, 0.0, 0
 
 
 @part

@@ -225,6 +225,7 @@ def copy_rows(source: AnyArray, target: AnyArray) -> None:
 @part
 def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: int) -> None:
     """The first step: no vehicle has been met."""
+    g = f.g
     for j in range(len(f.slot)):
         for c in range(STATUS):
             f.status[j, c] = 0.0
@@ -232,11 +233,11 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
     f.ego[LEFT + 3] = NOT_REMEMBERED_M2
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
-    insert(f.g, 0, PLACE)
-    insert_error(f.g, 0, COMMON, (model.common, model.common, model.common))
-    insert_error(f.g, 0, COMPASS, (model.bias, model.heading, model.offset))
-    insert_error(f.g, 0, RANGED, (model.ranged[0], 0.0, 0.0))
-    insert_error(f.g, 0, TURN, vector_at(model.turn, 0))
+    insert(g, 0, PLACE)
+    insert_error(g, 0, COMMON, (model.common, model.common, model.common))
+    insert_error(g, 0, COMPASS, (model.bias, model.heading, model.offset))
+    insert_error(g, 0, RANGED, (model.ranged[0], 0.0, 0.0))
+    insert_error(g, 0, TURN, vector_at(model.turn, 0))
     start(f, model, own, rows, count)
 
 
@@ -338,15 +339,16 @@ def needs_restart(f: Filter, own: Floats) -> bool:
     it for so long that they would be used again (and turn its odometry towards them), or its receiver is not trusted
     beside others that are not. One other suffices where the error of the ego's fixes would be beyond all doubt, or is
     the other's, too: it is the ego's."""
+    who = f.who
     others, last = heard(f, False), 0
     if heard(f, True):
         return False
-    if f.status[f.who[0, VEHICLE], TRUSTED] > 0.0:
-        return bool(f.who[0, REJECTED] > 0 and f.member[0, LOCKED] >= PATIENCE)
+    if f.status[who[0, VEHICLE], TRUSTED] > 0.0:
+        return bool(who[0, REJECTED] > 0 and f.member[0, LOCKED] >= PATIENCE)
     if f.ego[AGREED] > 0.0:
         return False
-    for k in range(1, len(f.who)):
-        last = k if f.who[k, VEHICLE] >= 0 and f.status[f.who[k, VEHICLE], USED] > -math.inf else last
+    for k in range(1, len(who)):
+        last = k if who[k, VEHICLE] >= 0 and f.status[who[k, VEHICLE], USED] > -math.inf else last
     error, noise = vector_at(f.g.x, f.g.block[0, ERROR]), sum(vector_at(own, FIX_VARIANCE // 3)) / 3.0
     gap = subtract(error, vector_at(f.g.x, f.g.block[last, ERROR]))
     far = inner_product(error, error)

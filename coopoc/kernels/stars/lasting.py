@@ -114,14 +114,15 @@ def remember_error(f: Filter, own: Floats) -> None:
 def add_lasting(f: Filter, model: Model, own: Floats) -> None:
     """Add to the answer's covariance what it is more uncertain by, as levels were otherwise, and the variance of errors
     of fixes that last: those of the ego, where pairs within two seconds count as one, or the mean of the star's."""
+    ego = f.ego
     for i in range(9):
-        f.ego[COVARIANCE + i] *= 1.0 + f.ego[UNSAID] / max(f.ego[WHOLE], 1e-300)
-    n, seconds = max(f.ego[PAIRS], 1.0), min(max(f.ego[CLOCK], ERROR_MEMORY_S), PRODUCT_MEMORY_S)
-    c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * ERROR_MEMORY_S / seconds, 1.0 / n)
+        ego[COVARIANCE + i] *= 1.0 + ego[UNSAID] / max(ego[WHOLE], 1e-300)
+    n, seconds = max(ego[PAIRS], 1.0), min(max(ego[CLOCK], ERROR_MEMORY_S), PRODUCT_MEMORY_S)
+    c, error = ego[PRODUCTS] / n, ego[PRODUCTS2] / n * max(2.0 * ERROR_MEMORY_S / seconds, 1.0 / n)
     if model.forget == 0.0:
         return
-    stated = f.ego[COVARIANCE] + f.ego[COVARIANCE + 4] + f.ego[COVARIANCE + 8]
+    stated = ego[COVARIANCE] + ego[COVARIANCE + 4] + ego[COVARIANCE + 8]
     shown = c - error / c - stated if c > 0.0 and c * c > error else 0.0
     more = max(shown, 3.0 * usual_error(f, ABSENT) / (1.0 + heard(f, True))) / sum(vector_at(own, FIX_VARIANCE // 3))
     for i in range(3):
-        f.ego[COVARIANCE + 4 * i] += more * own[FIX_VARIANCE + i]
+        ego[COVARIANCE + 4 * i] += more * own[FIX_VARIANCE + i]

@@ -158,11 +158,12 @@ def average(f: Filter, model: Model) -> None:
     `few` has a row for each number of the position and each error, and a column for each error: their covariances; the
     last two hold their means, and where they are in the state.
     """
+    ego = f.ego
     g, few, n, where = f.g, f.few, 3, len(f.few[0]) - 1
     for c in range(3):
-        few[c, where], f.ego[ANSWER + c] = c, g.x[c]
+        few[c, where], ego[ANSWER + c] = c, g.x[c]
         for d in range(3):
-            f.ego[COVARIANCE + 3 * c + d] = g.p[c, d]
+            ego[COVARIANCE + 3 * c + d] = g.p[c, d]
     for k in range(len(f.who) - 1, -1, -1):
         if f.who[k, VEHICLE] >= 0 and has(g, k, TURN):
             for c in range(3):
@@ -191,16 +192,16 @@ def average(f: Filter, model: Model) -> None:
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
         average_over_all(f, model, own)
     for c in range(3):
-        f.ego[BARE + c] = f.ego[COVARIANCE + 4 * c]
-        f.ego[OFFSET + c] = f.ego[ANSWER + c] - g.x[c]
+        ego[BARE + c] = ego[COVARIANCE + 4 * c]
+        ego[OFFSET + c] = ego[ANSWER + c] - g.x[c]
     for kind in range(5):
         i = scaled if kind == 4 else own + kind - (3 if kind < 2 else 2)
         there = n > scaled if kind == 4 else scaled > own if kind >= 2 else own > 3
-        f.ego[TOLD + kind] = few[i, where - 1] if there else 0.0
-    f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
+        ego[TOLD + kind] = few[i, where - 1] if there else 0.0
+    ego[TOLD + SLIPS] = ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
-        f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
-    f.ego[TOLD + LEVELS + MOTIONS] *= math.sqrt(1.0 + f.status[f.who[0, VEHICLE], LOUDER])
+        ego[TOLD + LEVELS + kind] = math.exp(0.5 * ego[LEVEL + kind])
+    ego[TOLD + LEVELS + MOTIONS] *= math.sqrt(1.0 + f.status[f.who[0, VEHICLE], LOUDER])
 
 
 @part
@@ -253,13 +254,14 @@ def collapse(f: Filter, i: int, n: int, there: float, first: int) -> None:
 def average_over_all(f: Filter, model: Model, own: int) -> None:
     """Average over whether the errors of all odometries are there, or none: evidence that none errs adds up,
     and its prior odds, too: noise that is not white makes either look surer. One vehicle counts as two."""
-    ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, max((own - 3) // 3, 2) * model.exact
+    few = f.few
+    ego, width, kept, odds = f.ego, len(few[0]) - 2, f.h.matrix, max((own - 3) // 3, 2) * model.exact
     for c in range(12):
         kept[c] = ego[ANSWER + c]
-    heading, scale = f.few[own - 3, width], f.few[own - 2, width]
+    heading, scale = few[own - 3, width], few[own - 2, width]
     for i in range(3, own):
         if i % 3 < 2:
-            odds += evidence(f.few[i, i - 3], f.few[i, width], model.turn[i % 3])
+            odds += evidence(few[i, i - 3], few[i, width], model.turn[i % 3])
             collapse(f, i, own, 0.0, i + 1)
     none = chance_of(odds)
     for c in range(12):
@@ -268,7 +270,7 @@ def average_over_all(f: Filter, model: Model, own: int) -> None:
     for c in range(3):
         for d in range(3):
             ego[COVARIANCE + 3 * c + d] += none * (1.0 - none) * kept[c] * kept[d]
-    f.few[own - 3, width], f.few[own - 2, width] = (1.0 - none) * heading, (1.0 - none) * scale
+    few[own - 3, width], few[own - 2, width] = (1.0 - none) * heading, (1.0 - none) * scale
 
 
 SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COURSE, _, _, BEFORE = range(
@@ -352,13 +354,14 @@ def corrected_motion(f: Filter, own: Floats, more: float) -> None:
 @part
 def remember_speed(f: Filter, own: Floats) -> None:
     """Remember the largest recent speed and its direction: locked wheels measure none."""
+    ego = f.ego
     u = scale(add(vector_at(own, MOTION // 3), vector_at(own[BY_FIXES:], 0)), 1.0 / own[DT])
-    speed, late = math.sqrt(inner_product(u, u)), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY_S)
-    f.ego[BLIND] += own[DT]
+    speed, late = math.sqrt(inner_product(u, u)), ego[SPEED_OF_LATE] * math.exp(-own[DT] / SPEED_MEMORY_S)
+    ego[BLIND] += own[DT]
     if speed > 0.5 * late:
-        f.ego[BLIND] = 0.0
-        store(f.ego[COURSE:], 0, scale(u, 1.0 / speed))
-    f.ego[SPEED_OF_LATE] = max(speed, late)
+        ego[BLIND] = 0.0
+        store(ego[COURSE:], 0, scale(u, 1.0 / speed))
+    ego[SPEED_OF_LATE] = max(speed, late)
 
 
 @part
@@ -366,17 +369,18 @@ def show(f: Filter) -> None:
     """After `innovate`: how far the ego may have slipped unmeasured. That is the distance of its fix, if it grew no
     faster than the ego drives and fixes err. If it grew faster, the fixes have jumped, which is no slip, until they are
     near again."""
+    ego = f.ego
     far, noise, before = 0.0, 0.0, 0.0
     for c in range(3):
-        before += f.ego[BEFORE + c] ** 2
-        f.ego[BEFORE + c] = f.h.three[GAP + c]
+        before += ego[BEFORE + c] ** 2
+        ego[BEFORE + c] = f.h.three[GAP + c]
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
-    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
-    more, f.ego[SINCE_FIX] = far - math.sqrt(before), 0.0
-    f.ego[SHOWN] = max(f.ego[SHOWN] + min(more, most), 0.0)
+    far, most = math.sqrt(far), ego[SPEED_OF_LATE] * ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
+    more, ego[SINCE_FIX] = far - math.sqrt(before), 0.0
+    ego[SHOWN] = max(ego[SHOWN] + min(more, most), 0.0)
     if more > most or far < 2.0 * math.sqrt(noise):
-        f.ego[JUMPED] = 1.0 if more > most else 0.0
+        ego[JUMPED] = 1.0 if more > most else 0.0
 
 
 @part
@@ -390,18 +394,19 @@ def slip(f: Filter, model: Model, own: Floats) -> None:
     """Add variance along the ego's way if this try assumes that it slips. A slip that begins now may have lasted for
     SLIP_HIDDEN_S already, but not farther than fixes err and have shown; where fixes correct the motion, not farther
     than these leave open."""
-    if f.ego[NOW] == 0.0:
+    ego = f.ego
+    if ego[NOW] == 0.0:
         return
-    rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
+    rate = (model.slip * ego[SPEED_OF_LATE]) ** 2
     variance = rate * own[DT] ** 2
-    if f.ego[SLIPPED] <= 0.5 and own[DT] < SLIP_HIDDEN_S:
+    if ego[SLIPPED] <= 0.5 and own[DT] < SLIP_HIDDEN_S:
         variance += min(rate * SLIP_HIDDEN_S**2, hidden(f, own))
-    if f.ego[CORRECTED] > 0.0:
-        variance = min(variance, LEFT_OPEN * f.ego[CORRECTED])
-    widen(f.g, 0, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
+    if ego[CORRECTED] > 0.0:
+        variance = min(variance, LEFT_OPEN * ego[CORRECTED])
+    widen(f.g, 0, min(SIDEWAYS + (TURNS * ego[BLIND]) ** 2, 1.0) * variance)
     for c in range(3):
         for d in range(3):
-            f.g.p[c, d] += variance * f.ego[COURSE + c] * f.ego[COURSE + d]
+            f.g.p[c, d] += variance * ego[COURSE + c] * ego[COURSE + d]
 
 
 @part
@@ -467,28 +472,30 @@ def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints, cou
 def moved(f: Filter, own: Floats) -> None:
     """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts; and
     where it would be, had it not left."""
+    ego = f.ego
     q = sum(vector_at(own, MOTION_VARIANCE // 3))
-    f.ego[MADE] += q
-    p, before = ego_variance(f), f.ego[WHOLE]
-    f.ego[UNSAID] *= p / before if p < before else 1.0  # errors of a heading cancel on a circle
-    more, f.ego[WHOLE] = max(p - before, q), p
+    ego[MADE] += q
+    p, before = ego_variance(f), ego[WHOLE]
+    ego[UNSAID] *= p / before if p < before else 1.0  # errors of a heading cancel on a circle
+    more, ego[WHOLE] = max(p - before, q), p
     for c in range(3):
-        f.ego[BARE + c] += more / 3.0 if f.ego[NOW] > 0.0 else own[MOTION_VARIANCE + c]
-    if f.ego[NOW] > 0.0:  # where odometry alone leads
-        level = math.exp(f.ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
-        more = max(q - 3.0 * level * f.ego[CORRECTED], 0.0)
+        ego[BARE + c] += more / 3.0 if ego[NOW] > 0.0 else own[MOTION_VARIANCE + c]
+    if ego[NOW] > 0.0:  # where odometry alone leads
+        level = math.exp(ego[LEVEL + MOTIONS]) * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
+        more = max(q - 3.0 * level * ego[CORRECTED], 0.0)
         for c in range(3):
-            f.ego[LEFT + c] -= own[BY_FIXES + c] if f.ego[CORRECTED] > 0.0 else 0.0
-    f.ego[LEFT + 3] += more / 3.0
+            ego[LEFT + c] -= own[BY_FIXES + c] if ego[CORRECTED] > 0.0 else 0.0
+    ego[LEFT + 3] += more / 3.0
 
 
 @part
 def corrected(f: Filter) -> None:
     """After an update of the ego: D (P+ / P-)^2, and so what it is more uncertain by than P, unless it began anew."""
-    p, before = ego_variance(f), f.ego[WHOLE]
+    ego = f.ego
+    p, before = ego_variance(f), ego[WHOLE]
     left = (p / before) ** 2 if before > 0.0 else 0.0
-    f.ego[MADE], f.ego[UNSAID] = min(f.ego[MADE] * left, p), f.ego[UNSAID] * min(left, 1.0)
-    f.ego[WHOLE] = p
+    ego[MADE], ego[UNSAID] = min(ego[MADE] * left, p), ego[UNSAID] * min(left, 1.0)
+    ego[WHOLE] = p
 
 
 @part
@@ -536,18 +543,19 @@ def adapt(f: Filter, model: Model) -> None:
     """Move the levels by what this step has shown, and count by how much the ego's variance would differ, had they
     been the same ever since: what is not made by motion, by fixes and messages alike. What errors of fixes that are
     states make follows no level."""
+    ego = f.ego
     if model.forget == 0.0:
         return
-    keep, changes = math.exp(-f.ego[SPAN] / model.forget), f.few[0]
+    keep, changes = math.exp(-ego[SPAN] / model.forget), f.few[0]
     for kind in range(KINDS_OF_NUMBERS):
-        change = f.ego[SLOPE + kind] / (f.ego[INFORMATION + kind] + PRIOR)
-        level = f.ego[LEVEL + kind] + min(max(change, -MAX_LEVEL_CHANGE), MAX_LEVEL_CHANGE)
+        change = ego[SLOPE + kind] / (ego[INFORMATION + kind] + PRIOR)
+        level = ego[LEVEL + kind] + min(max(change, -MAX_LEVEL_CHANGE), MAX_LEVEL_CHANGE)
         level = min(max(level, MIN_LEVEL), MAX_LEVEL)
-        changes[kind], f.ego[LEVEL + kind] = math.exp(level - f.ego[LEVEL + kind]) - 1.0, level
-        f.ego[SLOPE + kind] = 0.0
-        f.ego[INFORMATION + kind] *= keep
+        changes[kind], ego[LEVEL + kind] = math.exp(level - ego[LEVEL + kind]) - 1.0, level
+        ego[SLOPE + kind] = 0.0
+        ego[INFORMATION + kind] *= keep
     if has(f.g, 0, ERROR) or has(f.g, 0, COMMON):
         return
-    others, whole = heard(f, True), f.ego[WHOLE] + f.ego[UNSAID]
-    made, change = min(f.ego[MADE], whole), (changes[FIXES] + others * changes[MESSAGES]) / (1.0 + others)
-    f.ego[UNSAID] += made * changes[MOTIONS] + (whole - made) * change
+    others, whole = heard(f, True), ego[WHOLE] + ego[UNSAID]
+    made, change = min(ego[MADE], whole), (changes[FIXES] + others * changes[MESSAGES]) / (1.0 + others)
+    ego[UNSAID] += made * changes[MOTIONS] + (whole - made) * change

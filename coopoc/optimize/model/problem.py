@@ -99,9 +99,9 @@ class Problem:
         for field in ("names", "factors", "poses", "fixed", "constraints"):
             if not isinstance(value := getattr(self, field), str | Sequence):
                 self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
-        self.__dict__["names"] = tuple(str(name) for name in self.names)
-        if len(self._place) != len(self.names):
-            twice = sorted({n for n in self.names if self.names.count(n) > 1})
+        self.__dict__["names"] = names = tuple(map(str, self.names))
+        if len(self._place) != len(names):
+            twice = sorted({n for n in names if names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
         for field in ("poses", "fixed"):
             self.__dict__[field] = tuple(map(self.index, getattr(self, field)))

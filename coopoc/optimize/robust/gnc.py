@@ -113,17 +113,18 @@ def solve_gnc(
         best, x, graduation, doubts = contest(marked, inner, initial_guess(problem), lambda at: finish(at).x, cost)
         other = graduation if best == "graduated" else finish(x)
         best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
-    final = solve(marked.reweigh(end.weight, end.x), backend, throw=throw and end.settled, **options)
+    weight = end.weight
+    final = solve(marked.reweigh(weight, end.x), backend, throw=throw and end.settled, **options)
     status = final.status if end.settled else Status.MAX_ITERATIONS
-    out = int((end.weight < INLIER_WEIGHT).sum())
-    notes = (rejection("GNC", out, len(end.weight), "candidates", final.cost, final.expected),) if out else ()
+    out = int((weight < INLIER_WEIGHT).sum())
+    notes = (rejection("GNC", out, len(weight), "candidates", final.cost, final.expected),) if out else ()
     solution = replace(
         final,
         iterations=sum(each) + final.iterations,
         solve_seconds=clock() - began - final.build_seconds - final.check_seconds,
         status=status,
-        notes=(*notes, *doubts, *unconfirmed(marked, end.weight), *final.notes),
-        extras=final.extras | {"start": best, "weights": end.weight[marked.group]},
+        notes=(*notes, *doubts, *unconfirmed(marked, weight), *final.notes),
+        extras=final.extras | {"start": best, "weights": weight[marked.group]},
     )
     if throw and not end.settled:
         raise SolveError(solution)
