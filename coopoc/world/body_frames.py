@@ -99,7 +99,7 @@ def between_origins(recording: Recording, position: Floats, heading: Floats) -> 
     Args:
         recording: with tags t.
         position: p, (R, T, N, 3) m.
-        heading: h, (R, T, N) rad, NaN of what has no tag.
+        heading: h, (R, T, N) rad.
 
     >>> from coopoc import Sensors, observe
     >>> fleet = Fleet(("a", "b"), [0, 1], np.full((2, 2, 3), [[0.0] * 3, [9, 0, 0]]), np.zeros((2, 2, 3)))
@@ -109,7 +109,7 @@ def between_origins(recording: Recording, position: Floats, heading: Floats) -> 
     [3.0, 0.0, 0.0]
     """
     links, relative = recording.links, recording.relative.copy()
-    tips = position + turned(recording.tags, np.nan_to_num(heading))
+    tips = position + turned(recording.tags, heading)
     far, longer = (
         np.linalg.norm(ends[:, links.step, links.neighbour] - ends[:, links.step, links.observer], axis=-1)
         for ends in (position, tips)

@@ -149,7 +149,8 @@ class Recording:
             wrong, allowed = ~((values >= least) & (values < np.inf)), f"must be {'>' * stated or '>='} 0 and finite"
             refuse(name, values, wrong, allowed, f"{stated} means as `sensors` states.")
             self.__dict__[name] = values
-        tags = self.tags if plain(self.tags).size else np.zeros((len(ids), 3))
+        given = plain(self.tags)  # empty and of objects where rows are not equally long
+        tags = self.tags if given.size or given.dtype == object else np.zeros((len(ids), 3))
         self.__dict__["tags"] = tags = checked("tags", tags, "(N, 3)", (len(ids), 3))
         plausible("tags", tags, MAX_TAG)
         self.sensors.check_assumed()

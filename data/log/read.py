@@ -249,8 +249,8 @@ def read_log(
     members = {name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name)) for name in ids}
     if tag is not None:
         summary.assume("ranges are between tags, which only pose filters (frame=body) take off")
-    at = [np.zeros(3) if part.stands or tags.get(name) is None else tags[name] for name, part in members.items()]
-    recording = replace(_recording(rows, members, steps, mutual and not body, sensors), tags=np.array(at))
+    at: Any = [np.zeros(3) if part.stands or tags.get(name) is None else tags[name] for name, part in members.items()]
+    recording = replace(_recording(rows, members, steps, mutual and not body, sensors), tags=at)
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     fleet = None
     if len(true_rows):

@@ -145,5 +145,5 @@ def pose_measurements(
         recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark,
         np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),
         recording.dt,
-        np.append(recording.tags[list(members)], [[0.0] * 3], axis=0),
+        np.array([*recording.tags[list(members)], [0.0] * 3]),
     )
