@@ -440,13 +440,16 @@ def worst(c: Check, column: int) -> tuple[str, float, float]:
     rec, truth = c.world, c.log.truth
     size, t, squares = dimensions(rec), rec.t - rec.t[0], pd.Series(c.normalised[:, column]).dropna()
     tenths, fixes = np.arange(len(t)) * TENTHS // len(t), (rec.gnss[0], np.square(rec.fix_scale * rec.sensors.fix_std))
-    for what, x, variance in () if truth is None else (("filter errs", c.x, c.variance), ("fixes are off", *fixes)):
-        square, stated = np.square(x - truth.position)[:, column, :size], variance[:, column, :size]
-        there = np.isfinite(square)
-        sums = [pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)]
-        ratios = (sums[0] / sums[1])[sums[1] > 0.0] ** 0.5
-        if ratios.max() > CONFIDENT_RATIO:
-            return what, float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
+    if truth is not None:
+        for what, x, variance in (("filter errs", c.x, c.variance), ("fixes are off", *fixes)):
+            square, stated = np.square(x - truth.position)[:, column, :size], variance[:, column, :size]
+            there = np.isfinite(square)
+            sums = [
+                pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)
+            ]
+            ratios = (sums[0] / sums[1])[sums[1] > 0.0] ** 0.5
+            if ratios.max() > CONFIDENT_RATIO:
+                return what, float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
     parts = squares.groupby(tenths[squares.index])
     square = pd.concat([pd.Series([0.0]), squares, parts.transform("mean")])
     count = np.concatenate([[1], np.ones(len(squares)), parts.transform("size")])
