@@ -138,11 +138,11 @@ def test_a_position_filter_notes_offsets_of_pairs(tmp_path):
 
 
 def test_what_lies_between_two_and_four_standard_errors_may_be(tmp_path):
-    folder = strange(tmp_path / "log", "drone", 1, wheels={"drone1": 0.015}, pairs={("drone0", "drone3"): 0.16})
+    folder = strange(tmp_path / "log", "drone", 1, wheels={"drone1": 0.015}, pairs={("drone0", "drone3"): 0.21})
     (folder / "truth.csv").unlink()
     text = said(folder)
     assert re.search(r"drone1: its odometry may be too fast by 1", text), text
-    assert re.search(r"drone0 and drone3 by \+0\.1\d+ \+- \S+ m may be off", text), text
+    assert re.search(r"drone0 and drone3 by \+0\.[12]\d+ \+- \S+ m may be off", text), text
 
 
 OTHER = {"drone1": "drone2", "drone2": "drone1"}

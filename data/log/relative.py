@@ -281,7 +281,8 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
         offset, error = median(c.relative[rows, k])
         position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)
         error = float(np.sqrt(error**2 + stated**2 / len(rows) + position * lasts))
-        if abs(offset) > max(PERHAPS * error, 0.25 * stated):
+        # of so many pairs one is beyond it in twenty logs, as by Bonferroni
+        if abs(offset) > max(PERHAPS * names.nunique() ** 0.15 * error, 0.25 * stated):
             named.append((str(pair), offset, error))
     return sorted(named, key=lambda row: -abs(row[1]))
 
