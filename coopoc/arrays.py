@@ -8,14 +8,14 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError, shown, unknown
 
-Floats: TypeAlias = npt.NDArray[np.floating[Any]]
-Ints: TypeAlias = npt.NDArray[np.int64]
-Bools: TypeAlias = npt.NDArray[np.bool_]
-AnyArray: TypeAlias = npt.NDArray[Any]
+Floats: TypeAlias = NDArray[np.floating[Any]]
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+AnyArray: TypeAlias = NDArray[Any]
 
 DTYPE_KINDS = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
 """Allowed kinds of dtype -> the name of one entry."""
@@ -27,7 +27,7 @@ Limits: TypeAlias = Mapping[str, tuple[float, float, str]]
 """Field -> least and largest value, and both in words."""
 
 
-def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
+def frozen(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
     """Read-only, contiguous and aligned array of `values`: compiled code may rely on all three.
 
     >>> frozen([1, 2]).flags.writeable
@@ -46,7 +46,7 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
 
 
 def checked(
-    field: str, values: npt.ArrayLike, axes: str = "", shape: tuple[int, ...] | None = None, dtype: Any = float
+    field: str, values: ArrayLike, axes: str = "", shape: tuple[int, ...] | None = None, dtype: Any = float
 ) -> AnyArray:
     """`frozen` values of one of DTYPE_KINDS with that shape.
 
@@ -107,7 +107,7 @@ def plain(values: object) -> AnyArray:
             return np.asarray(values)
         except Exception:  # a class from elsewhere may raise anything
             pass
-    return np.empty(0, dtype=object)
+    return np.empty(0, object)
 
 
 def listed(field: str, values: Any, hint: str, allowed: str = "must be a sequence") -> list[Any]:
@@ -210,7 +210,7 @@ def one_of(noun: str, name: object, known: Any) -> str:
     return name
 
 
-def last_true(flags: npt.ArrayLike, axis: int = 0) -> Ints:
+def last_true(flags: ArrayLike, axis: int = 0) -> Ints:
     """Index along an axis of the last True until there, -1 before the first.
 
     >>> last_true(np.array([False, True, False])).tolist()
@@ -227,7 +227,7 @@ def robust_std(values: Floats) -> float:
     >>> round(robust_std(np.array([-1.0, 0, 1, 100])), 4)
     1.4826
     """
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return float(1.4826 * np.median(abs(values - np.median(values))))
 
 
 def check_turns(field: str, angles: Floats) -> None:
@@ -238,7 +238,7 @@ def check_turns(field: str, angles: Floats) -> None:
     coopoc.errors.InputError: heading[1] = 90.0: must be in rad, and jump by less than two turns. Convert degrees by \
 np.deg2rad, and wrap what is unwrapped.
     """
-    jump = np.abs(np.diff(angles, axis=0, prepend=0.0) if angles.ndim else angles) > TWO_TURNS
+    jump = abs(np.diff(angles, axis=0, prepend=0.0) if angles.ndim else angles) > TWO_TURNS
     hint = "Convert degrees by np.deg2rad, and wrap what is unwrapped."
     refuse(field, angles, jump, "must be in rad, and jump by less than two turns", hint)
 
@@ -269,7 +269,7 @@ def named(field: str, values: object, hint: str) -> dict[str, Any]:
     raise InputError(field, shown(values), "must be a mapping from names", hint)
 
 
-def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hint: str) -> None:
+def refuse(field: str, values: AnyArray, wrong: ArrayLike, allowed: str, hint: str) -> None:
     """InputError that names the first value where `wrong` is true, if there is one; both have the same shape.
 
     >>> refuse("step", np.array([3, -1]), [False, True], "must be >= 0", "Count steps from 0.")

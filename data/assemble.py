@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+from numpy import nan
 
 from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
@@ -65,8 +66,8 @@ def assemble(
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
     column, names = pd.Series(vehicle).factorize()
     ids = tuple(names)
-    numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
-    stamps = np.round(np.asarray(t, dtype=float), 6)
+    numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, float)
+    stamps = np.round(np.asarray(t, float), 6)
     order = np.argsort(column, kind="stable")
     back = np.flatnonzero((np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0))
     if len(back):
@@ -121,7 +122,7 @@ def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: s
     >>> backward_difference(np.array([0, 0.5]), np.array([[[0.0, 0, 0]], [[1, 0, 0]]]), ["a"])[1, 0]
     array([2., 0., 0.])
     """
-    u = np.full_like(position, np.nan)
+    u = np.full_like(position, nan)
     if len(t) > 1:
         u[1:] = np.diff(position, axis=0) / np.diff(t)[:, None, None]
         starts = np.isfinite(position[:-1]) & ~np.isfinite(u[:-1])
@@ -144,9 +145,9 @@ def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floa
     array([0.5, nan])
     """
     stamp = t[np.clip(np.searchsorted(t, grid - SAME_INSTANT), 0, len(t) - 1)]
-    grid = np.where(np.abs(grid - stamp) <= SAME_INSTANT, stamp, grid)
-    out = np.column_stack([np.interp(grid, t, v, left=np.nan, right=np.nan) for v in values.T])
-    return np.where(covered(t, grid, max_gap, 0.0)[:, None], out, np.nan)
+    grid = np.where(abs(grid - stamp) <= SAME_INSTANT, stamp, grid)
+    out = np.column_stack([np.interp(grid, t, v, left=nan, right=nan) for v in values.T])
+    return np.where(covered(t, grid, max_gap, 0.0)[:, None], out, nan)
 
 
 def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
@@ -160,7 +161,7 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
     between = (
         (at >= t[left] - SAME_INSTANT) & (at <= t[right] + SAME_INSTANT) & (t[right] - t[left] <= gap + SAME_INSTANT)
     )
-    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME_INSTANT
+    near = np.minimum(abs(at - t[left]), abs(at - t[right])) <= edge + SAME_INSTANT
     return between | near
 
 
@@ -214,7 +215,7 @@ def check_time(t: Floats, file: str, column: str = "t") -> None:
 
     >>> check_time(np.array([1.7e9]), "drive.csv")
     """
-    late = t[np.abs(t) > 1e11]  # the year 5138
+    late = t[abs(t) > 1e11]  # the year 5138
     if len(late):
         raise InputError(
             f"{file}: column {column}",
@@ -244,11 +245,11 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     gaps = np.diff(instants) if len(instants) > 1 else np.ones(1)
     step = np.rint((instants - instants[0]) / gaps.min())
     if step[-1] <= 50 * len(step):
-        index = step.astype(np.int64)
+        index = step.astype(int)
         grid = np.round(np.linspace(instants[0], instants[-1], index[-1] + 1), 6)
-        if np.abs(grid[index] - instants).max() <= 1e-3 * gaps.min() + 1e-6:
+        if abs(grid[index] - instants).max() <= 1e-3 * gaps.min() + 1e-6:
             grid[index] = instants
-            table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
+            table = np.full((len(grid), column.max() + 1, numbers.shape[1]), nan)
             table[index[row_of], column] = numbers
             return grid, table
     raise InputError(
@@ -282,7 +283,7 @@ def steps_of(t: Floats, dt: float, steps: int) -> Ints:
     array([ 2, -1])
     """
     step = np.rint(t / dt)
-    return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64)
+    return np.where((step >= 0) & (step < steps), step, -1).astype(int)
 
 
 def planar_recording(
@@ -312,11 +313,11 @@ def planar_recording(
     n = len(ids) - len(position)
     dt = t[1] - t[0]
     step = steps_of(table[:, 0], dt, len(t))
-    table = np.column_stack([step, table[:, 1:]])[nearest(np.abs(table[:, 0] - dt * step), step, *table[:, 1:3].T)]
+    table = np.column_stack([step, table[:, 1:]])[nearest(abs(table[:, 0] - dt * step), step, *table[:, 1:3].T)]
     table = table[np.lexsort(table[:, [3, 1, 0]].T)]
-    links = Links(*table[:, :3].astype(np.int64).T)
+    links = Links(*table[:, :3].astype(int).T)
     shape = (1, len(t), len(ids), 3)
-    gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
+    gnss, moved, turning = np.full(shape, nan), np.zeros(shape), np.zeros(shape[:3])
     gnss[0, :, n:] = position @ np.eye(2, 3)
     moved[0, :, :n, :2], turning[0, :, :n] = velocity, yaw_rate
     return Recording(
@@ -332,6 +333,6 @@ def planar_recording(
         v2x=V2X(max_neighbours=n - 1, radius=np.inf),
         observers=tuple(range(len(ids))),
         notes=(note, "inclination was not measured: pi/2 by the constraint z = 0"),
-        body=Body(turning, np.full(turning.shape, np.nan)),
+        body=Body(turning, np.full(turning.shape, nan)),
         landmarks=tuple(range(n, len(ids))),
     )

@@ -162,7 +162,7 @@ def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
         texts = cells.map(lambda cell: str(cell)[:300])
         values = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
-    _refuse(cells, ~(np.abs(values) <= MAX_NUMBER), file, "must be a finite number")
+    _refuse(cells, ~(abs(values) <= MAX_NUMBER), file, "must be a finite number")
     return values
 
 
@@ -193,9 +193,9 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
             ) from None
     _refuse(column_values, column_values.isna().to_numpy(), file, "must be a time")
     if kind == "m":
-        return np.asarray(column_values.dt.total_seconds(), dtype=float)
+        return np.asarray(column_values.dt.total_seconds(), float)
     utc = pd.to_datetime(column_values, utc=True)
-    return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, dtype=float)  # in ns years end at 2262
+    return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, float)  # in ns years end at 2262
 
 
 def factors(mapping: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
@@ -216,7 +216,7 @@ def words(frame: "pd.DataFrame", column: str, file: str) -> list[str]:
     named_cells = filled(cells)
     _refuse(cells.astype(object).where(named_cells, "empty"), ~named_cells, file, "must be a name")
     number, each = cells.astype(str).factorize()
-    return list(np.array([WHOLE.sub(r"\1", cell.strip()) for cell in each], dtype=object)[number].tolist())
+    return list(np.array([WHOLE.sub(r"\1", cell.strip()) for cell in each], object)[number].tolist())
 
 
 def filled(cells: "pd.Series[Any]") -> Bools:

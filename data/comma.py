@@ -56,7 +56,7 @@ def read_segment(path: Path, summary: Summary) -> Rows:
 def _array(path: Path, name: str) -> Floats:
     """(M, columns) finite numbers, M > 0."""
     try:
-        array = np.array(np.load(path / name, mmap_mode="r"), dtype=float)  # a header may claim more than there is
+        array = np.array(np.load(path / name, mmap_mode="r"), float)  # a header may claim more than there is
         array = array.reshape(len(array), -1)
         if not np.isfinite(array).all():
             raise ValueError("numbers that are not finite")

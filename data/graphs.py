@@ -57,7 +57,7 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
             rate = np.diff(np.interp(t, stamps, np.append(0.0, np.cumsum(each)))) / SAMPLE
             std = np.sqrt(np.mean(edges.covariance[index, k, k][lasts > 0] / lasts[lasts > 0]) / SAMPLE)
             parts.append({"t": t[1:] - SAMPLE / 2, "vehicle": robot, kind: rate, f"{kind}_std": max(std, MIN_STD)})
-    who, position = np.array(names, dtype=object), graph.position
+    who, position = np.array(names, object), graph.position
     one, other = who[ranges.nodes.T]
     measured = {"range": ranges.distance, "range_std": np.sqrt(ranges.variance)}
     parts.append({"t": ranges.stamps, "vehicle": one, "partner": other, **measured})

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy import inf, nan
 
 from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
@@ -113,9 +114,9 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     member = {n: k for k, n in enumerate([*numbers, *marks[:, 0].tolist()])}
     table[:, 2] = [member.get(subject, -1) for subject in table[:, 2].tolist()]
     exact = [interpolate(a[:, 0] - start, a[:, 1:], table[:, 0], max_gap) for a in truths]
-    at = [np.broadcast_to([x, y, np.nan], (len(table), 3)) for x, y in marks[:, 1:].tolist()]
-    every = np.stack([*exact, *at, np.full((len(table), 3), np.nan)])
-    here, there = (every[table[:, k].astype(np.int64), np.arange(len(table))] for k in (1, 2))
+    at = [np.broadcast_to([x, y, nan], (len(table), 3)) for x, y in marks[:, 1:].tolist()]
+    every = np.stack([*exact, *at, np.full((len(table), 3), nan)])
+    here, there = (every[table[:, k].astype(int), np.arange(len(table))] for k in (1, 2))
     dx, dy = (there - here)[:, :2].T
     position = np.dstack([poses[..., :2], 0 * poses[..., 0]])
     ids = tuple(f"robot{n}" for n in numbers)
@@ -216,7 +217,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     logged = Signal(t, log.speed), Signal(t, log.turn_rate)
     lag = min(LAGS, key=lambda lag: np.nanvar(rate - between(logged[1], t - lag)[first]))
     wheel, turning = (between(each, t - lag)[first] for each in logged)
-    speed, lost = _factors(window, velocity[..., 0], wheel, wheel * np.abs(turning))
+    speed, lost = _factors(window, velocity[..., 0], wheel, wheel * abs(turning))
     (turn,), slip = _factors(window, rate, turning), -lost / speed
     driven = _driven(speed, slip, wheel, turning)
     ahead, aside, off = velocity[..., 0] - driven, velocity[..., 1], rate - turn * turning
@@ -241,7 +242,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
 
 def _driven(speed: Floats, slip: Floats, wheel: Floats, turning: Floats) -> Floats:
     """(T, N) m/s, forward speed of what was logged."""
-    return np.asarray(speed * wheel * np.maximum(1.0 - slip * np.abs(turning), 0.0))
+    return np.asarray(speed * wheel * np.maximum(1.0 - slip * abs(turning), 0.0))
 
 
 def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
@@ -254,10 +255,10 @@ def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
 
 
-def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = np.inf) -> float:
+def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = inf) -> float:
     """Standard deviation of white noise whose sums over what a robot measures in a window are as large as those of the
     errors (M,), those beyond a gate of robust standard deviations aside."""
-    inlier = np.abs(error - np.median(error)) <= gate * robust_std(error)
+    inlier = abs(error - np.median(error)) <= gate * robust_std(error)
     group = np.unique(observer[inlier] * 10**6 + np.floor(t[inlier] / ERROR_SECONDS), return_inverse=True)[1]
     return float(np.sqrt((np.bincount(group, error[inlier]) ** 2).sum() / inlier.sum()))
 
@@ -310,15 +311,15 @@ def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
         table = pd.read_csv(file, sep=r"\s+", comment="#", header=None, dtype=float).to_numpy()
     except (ValueError, OverflowError):  # those of pandas for text, empty files and bytes among them
         table = np.empty((0, 0))
-    if table.shape[1:] != (len(form.split()),) or not (np.abs(table) <= MAX_NUMBER).all():
+    if table.shape[1:] != (len(form.split()),) or not (abs(table) <= MAX_NUMBER).all():
         table = read_table(file, form)[1]  # slow; names the line
     if form.startswith("time"):
         check_time(table[:, 0], file.name)
-        gap = np.diff(table[:, 0], prepend=-np.inf)
+        gap = np.diff(table[:, 0], prepend=-inf)
         order = f"must {'increase' if strictly else 'not decrease'} in time from line to line"
         _refuse(file, gap <= 0 if strictly else gap < 0, order, "Correct or remove the stamp that is out of order.")
         angle = f"must have a {form.rpartition(' ')[2]} within a turn (a second), in rad"
-        _refuse(file, np.abs(table[:, -1]) > MAX_BEARING_RAD, angle, "Convert degrees to radians.")
+        _refuse(file, abs(table[:, -1]) > MAX_BEARING_RAD, angle, "Convert degrees to radians.")
     return np.array(table)
 
 

@@ -39,7 +39,7 @@ def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
     parts = []
     try:
         for drive in torch.load(path, map_location="cpu", weights_only=True):
-            arrays = {name: np.asarray(drive[name], dtype=float)[:, :n] for name, n in FIELDS.items()}
+            arrays = {name: np.asarray(drive[name], float)[:, :n] for name, n in FIELDS.items()}
             date, (x, y), (true_x, true_y) = drive["data_date"], arrays["filtered_gps"].T, arrays["ground_truth"].T
             speed = arrays["filtered_wheel"].mean(axis=1)
             table = pd.DataFrame({"t": np.arange(len(x)), "x": x, "y": y, "speed": speed})

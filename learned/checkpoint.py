@@ -54,8 +54,8 @@ class Checkpoint:
 
         The loss of a federation is the mean over its clients, weighted by their training pieces.
         """
-        losses = [np.asarray(r["validation_loss"], dtype=float) for r in self.card["history"][: row + 1]]
-        weights = np.asarray(self.card["training_pieces"], dtype=float)
+        losses = [np.asarray(r["validation_loss"], float) for r in self.card["history"][: row + 1]]
+        weights = np.asarray(self.card["training_pieces"], float)
         means = [float(np.average(loss, weights=weights)) if loss.ndim else float(loss) for loss in losses]
         return int(np.argmin(np.where(np.isfinite(means), means, np.inf)))
 

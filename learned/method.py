@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from coopoc.arrays import Floats, check_fields
@@ -32,21 +32,19 @@ class GainStream:
         history: s, how old a delayed fix may be.
     """
 
-    def __init__(self, model: Any, x0: npt.ArrayLike | None, history: float) -> None:
+    def __init__(self, model: Any, x0: ArrayLike | None, history: float) -> None:
         self.history, self._model = MotionHistory(history), model
         self._x: Floats = np.full(3, np.nan) if x0 is None else three("x0", x0)
         self._memory = model.start(torch.zeros((1, 3), dtype=next(model.parameters()).dtype))
 
     @one_core()
-    def step(
-        self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
-    ) -> tuple[Floats, None]:
+    def step(self, gnss: ArrayLike | None, velocity: ArrayLike, dt: float, fix_age: float = 0.0) -> tuple[Floats, None]:
         """Position (3,) m, NaN before the first fix, as `FilterStream.step`; a net has no covariance.
 
         The net gets the motion as a velocity over one second; a fix of NaN only predicts.
         """
         self.history.check(gnss, velocity, dt, fix_age)
-        moved = dt * np.asarray(velocity, dtype=float)
+        moved = dt * np.asarray(velocity, float)
         self.history.push(dt, moved, np.zeros(3))
         fix, _ = self.history.forward(gnss, fix_age)
         if np.isnan(self._x).all():
@@ -92,7 +90,7 @@ class LearnedGain(Alone):
         if not callable(self.model) or not callable(getattr(self.model, "start", None)):
             raise InputError("model", shown(self.model), "must be a net with start and step", "Give GainNet().")
 
-    def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> GainStream:
+    def start(self, x0: ArrayLike | None = None, *, history: float = 10.0) -> GainStream:
         """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.
 
         Args:
@@ -113,7 +111,7 @@ class LearnedGain(Alone):
         origin, x0 = fixes[:, :1], start_of(self.x0, fixes[:, 0])
         lanes = _lanes(fixes[:, 1:] - origin), _lanes(speeds[:, 1:]), _lanes(x0[:, None] - origin)[:, 0]
         with one_core(), torch.inference_mode():
-            moved = self.model(*lanes, recording.dt).numpy().astype(np.float64)
+            moved = self.model(*lanes, recording.dt).numpy().astype(float)
         moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, 3), 2, 1)
         estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
@@ -124,4 +122,4 @@ class LearnedGain(Alone):
 def _lanes(array: Floats) -> Tensor:
     """(R E, T, 3) for the net of (R, T, E, 3)."""
     flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], 3)
-    return torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32))
+    return torch.from_numpy(np.ascontiguousarray(flat, np.float32))

@@ -1,10 +1,10 @@
 """Training of recipes: `train_all` makes every checkpoint that a study needs, or finds it."""
 
-import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from math import inf, sqrt
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ def train_all(
     aggregate: str | None = None,
     jobs: int = 1,
     progress: bool = True,
-    worst: float = math.inf,
+    worst: float = inf,
 ) -> dict[str, Checkpoint]:
     """Train every recipe in every setting, or read it from `out` where the same was trained before.
 
@@ -105,7 +105,7 @@ def train_all(
 def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> None:
     """Train and save a checkpoint."""
     checkpoint = trained(job, fleet, progress)
-    if worst < math.inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
+    if worst < inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
         allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
         hint = "Give more data or another recipe; --worse saves it all the same."
         raise InputError(f"validation error of {job.label}", f"{times:.2f} times", allowed, hint)
@@ -130,7 +130,7 @@ def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
     )
     fitted = NoiseParameters().with_logs(torch.stack([process, torch.full((3,), LEAST_STD), gnss]).log())
     ours, theirs = (float(Judge([[validation]], net)(flatten([net]))) for net in (model, fitted))
-    return math.sqrt(ours / theirs)
+    return sqrt(ours / theirs)
 
 
 def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:

@@ -196,9 +196,9 @@ def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
         landmarks: how many stay, at most.
         start: step.
     """
-    marks = np.array(recording.landmarks, dtype=np.int64)
+    marks = np.array(recording.landmarks, int)
     landmarks = min(landmarks, len(marks))
-    chosen = marks[(len(marks) / max(landmarks, 1) * np.arange(landmarks)).astype(np.int64)]
+    chosen = marks[(len(marks) / max(landmarks, 1) * np.arange(landmarks)).astype(int)]
     links = recording.links
     gone = np.isin(links.neighbour, marks) & ~np.isin(links.neighbour, chosen) & (links.step >= start)
     return with_links(recording, ~gone)

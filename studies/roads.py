@@ -155,10 +155,10 @@ def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording
     path = np.interp(now, now[there], plane(truth.position[there, column]))
     motion = np.diff(path, prepend=path[0])
     measured = plane(recording.velocity[0, :, column]) * dt
-    fast = (np.abs(motion) > MIN_COURSE_SPEED * dt) & np.isfinite(measured)
+    fast = (abs(motion) > MIN_COURSE_SPEED * dt) & np.isfinite(measured)
     last = np.maximum(last_true(fast), np.argmax(fast))  # where the vehicle is slow, the ratio is as before
     times = (np.where(fast, measured, 1.0) / np.where(fast, motion, 1.0))[last]
-    ratio = np.clip(np.abs(times), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(times), -0.5, 0.5))
+    ratio = np.clip(abs(times), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(times), -0.5, 0.5))
     error = plane(recording.gnss[0, :, column]) - path
     route, rows = slice(starts[0], starts[0] + length), np.array(starts) + np.arange(length)[:, None]
     offset = START_SPREAD * np.random.default_rng(SEED).uniform(-1, 1, (len(starts), 2)) @ [1, 1j] / np.sqrt(2)

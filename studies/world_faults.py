@@ -6,6 +6,8 @@ from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy import nan
+from numpy.linalg import norm
 
 from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
@@ -140,7 +142,7 @@ def _outage(scene: Scene, rng: Draws, start: bool) -> Made:
     if start:
         until = rng.uniform(10.0, 40.0)
         when, words = (scene.fleet.t > 0) & (scene.fleet.t < until), f"until {until:.0f} s"
-    return scene.edited(partial(_times, "gnss", np.nan, when, scene.egos)), words
+    return scene.edited(partial(_times, "gnss", nan, when, scene.egos)), words
 
 
 def _receiver(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), start: float | None = None) -> Made:
@@ -148,7 +150,7 @@ def _receiver(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), 
     size, length = log_uniform(rng, 5.0, 60.0), rng.uniform(*ramp)
     attack = Spoofing(1.0, start=rng.uniform(5.0, 25.0) if start is None else start, ramp=length)
     toward = rng.normal(size=(RUNS, EGOS, 3)) * [1.0, 1.0, 0.3]
-    offset = size * toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+    offset = size * toward / norm(toward, axis=-1, keepdims=True)
     moved = attack.size(scene.fleet.t)[:, None, None] * offset[:, None]
     words = f"{size:.0f} m from {attack.start:.0f} s on" + f" over {length:.0f} s" * (length > 0)
     return scene.edited(partial(_shifted, columns=list(scene.egos), offset=moved)), words
@@ -184,7 +186,7 @@ def _long(scene: Scene, rng: Draws, stated: bool) -> Made:
 
 
 def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Made:
-    left = np.where(np.isin(range(3), columns), 1.0, np.nan)
+    left = np.where(np.isin(range(3), columns), 1.0, nan)
     return scene.edited(lambda noisy: replace(noisy, relative=left * noisy.relative)), "in the whole drive"
 
 
@@ -243,7 +245,7 @@ def _liars(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), col
 def _sybil(scene: Scene, rng: Draws) -> Made:
     """One vehicle beside an ego sends as several: all are measured where it is, and claim to be elsewhere together."""
     fleet, count = scene.fleet, int(rng.integers(1, 5))
-    gap = np.linalg.norm(fleet.position[:, scene.others] - fleet.position[:, scene.egos[:1]], axis=-1)
+    gap = norm(fleet.position[:, scene.others] - fleet.position[:, scene.egos[:1]], axis=-1)
     liar = int(scene.others[np.argmin(gap.mean(axis=0))])
     toward, start = rng.uniform(-1.0, 1.0, (RUNS, 3)), rng.uniform(0.0, 25.0)
     offset = log_uniform(rng, 5.0, 40.0) * toward
@@ -268,7 +270,7 @@ def _come_and_go(scene: Scene, rng: Draws) -> Made:
         start, stop = np.sort(rng.uniform(0.0, t[-1], 2))
         away = (t < start) | (t >= stop) if rng.uniform() < 0.5 else (t >= start) & (t < stop)
         away[-1] &= not away.all()
-        position[away, column] = velocity[away, column] = np.nan
+        position[away, column] = velocity[away, column] = nan
     scene = scene._replace(fleet=replace(scene.fleet, position=position, velocity=velocity))
     return scene, f"{len(who)} of {len(scene.others)}"
 

@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy import pi
 
 from coopoc import V2X, Fleet, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, number, one_of
@@ -155,20 +156,20 @@ def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:
     across = 3.5 * rng.integers(0, 2, count) + 0.3 * np.sin(along / 40.0 + rng.uniform(0, 6, count))
     incline = rng.uniform(-0.04, 0.04)
     road = np.stack([along, across, incline * along], axis=-1)
-    return turned(road, np.array(rng.uniform(-np.pi, np.pi)))
+    return turned(road, np.array(rng.uniform(-pi, pi)))
 
 
 def _platoon(rng: Draws, t: Floats, _: Split) -> Floats:
     count, speed, period = int(rng.integers(4, 11)), rng.uniform(6.0, 30.0), rng.uniform(15.0, 40.0)
-    phase = 2 * np.pi * (t[:, None] / period + 0.03 * np.arange(count))
-    wave = 0.2 * speed * period / (2 * np.pi) * np.sin(phase)
+    phase = 2 * pi * (t[:, None] / period + 0.03 * np.arange(count))
+    wave = 0.2 * speed * period / (2 * pi) * np.sin(phase)
     return _column(rng, speed * t[:, None] + wave, (8.0, 25.0))
 
 
 def _stop_and_go(rng: Draws, t: Floats, _: Split) -> Floats:
     count, speed, period = int(rng.integers(4, 11)), rng.uniform(4.0, 14.0), rng.uniform(12.0, 30.0)
     fine = np.linspace(t[0] - 30.0, t[-1], 4000)
-    share = np.clip(0.5 + 1.2 * np.sin(2 * np.pi * fine / period), 0.0, 1.0)
+    share = np.clip(0.5 + 1.2 * np.sin(2 * pi * fine / period), 0.0, 1.0)
     travelled = np.append(0.0, np.cumsum(share[1:])) * speed * (fine[1] - fine[0])
     reacts = rng.uniform(0.5, 2.0) * np.arange(count)  # the wave runs backwards
     return _column(rng, np.interp(t[:, None] - reacts, fine, travelled), (8.0, 20.0))
@@ -177,7 +178,7 @@ def _stop_and_go(rng: Draws, t: Floats, _: Split) -> Floats:
 def _circle(rng: Draws, t: Floats, _: Split) -> Floats:
     count, radius, speed = int(rng.integers(4, 11)), rng.uniform(12.0, 45.0), rng.uniform(3.0, 12.0)
     ring = radius + rng.uniform(-3.0, 3.0, count)
-    angle = speed / radius * t[:, None] + 2 * np.pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count
+    angle = speed / radius * t[:, None] + 2 * pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count
     return _points(rng, ring * np.cos(angle), ring * np.sin(angle))
 
 
@@ -186,7 +187,7 @@ def _crossing(rng: Draws, t: Floats, _: Split) -> Floats:
     speed, passes = rng.uniform(4.0, 12.0, count), np.sort(rng.uniform(0.0, t[-1], count))
     along, side = speed * (t[:, None] - passes), rng.uniform(2.0, 6.0, count)
     lane = _points(rng, along, side)
-    return turned(lane, np.broadcast_to(np.pi / 2 * rng.integers(0, 4, count), along.shape))
+    return turned(lane, np.broadcast_to(pi / 2 * rng.integers(0, 4, count), along.shape))
 
 
 def _standing(rng: Draws, t: Floats, _: Split) -> Floats:

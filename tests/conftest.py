@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy import nan, pi
+from numpy.random import default_rng
 from scipy import stats
 
 from coopoc import V2X, Fleet, Links, Recording, Sensors, load_fleet, observe
@@ -93,9 +95,9 @@ def moving(letter: str, t: Floats, position: Floats) -> Fleet:
 def formation_fleet(vehicles: int = 11, steps: int = 901) -> Fleet:
     """Rigid formation within 30 m on a gently sinuous path at 10 m/s: ten on a ring (docs/decisions.md)."""
     t = np.arange(steps) * 0.1
-    course = 0.3 * np.sin(2 * np.pi * t / 60)
+    course = 0.3 * np.sin(2 * pi * t / 60)
     path = np.cumsum(np.c_[np.cos(course), np.sin(course), 0 * t], axis=0)
-    around = np.linspace(0, 2 * np.pi, vehicles - 1, endpoint=False)
+    around = np.linspace(0, 2 * pi, vehicles - 1, endpoint=False)
     gap = np.linspace(22.0, 22.1, vehicles - 1)
     offset = np.vstack([np.zeros(3), np.c_[gap * np.cos(around), gap * np.sin(around), 0 * gap]])
     position = path[:, None] + offset
@@ -104,7 +106,7 @@ def formation_fleet(vehicles: int = 11, steps: int = 901) -> Fleet:
 
 def crossing_fleet() -> Fleet:
     """Vehicles that cross a square of 60 m at their own heights and speeds: neighbours come and go, z matters."""
-    rng, t = np.random.default_rng(3), np.arange(60) * 0.1
+    rng, t = default_rng(3), np.arange(60) * 0.1
     start = rng.uniform(-30, 30, (8, 3)) * [1, 1, 0.1]
     speed = rng.normal(0, 6, (8, 3)) * [1, 1, 0.05]
     wobble = np.sin(t[:, None, None] + np.arange(8)[:, None])
@@ -116,7 +118,7 @@ def without(fleet: Fleet, *away: tuple[slice, int | slice]) -> Fleet:
     """The fleet whose vehicles are away: (steps, columns)."""
     there = np.ones(fleet.position.shape)
     for steps, columns in away:
-        there[steps, columns] = np.nan
+        there[steps, columns] = nan
     return replace(fleet, position=there * fleet.position, velocity=there * fleet.velocity)
 
 
@@ -128,7 +130,7 @@ def coming_and_going(fleet: Fleet) -> Fleet:
 
 def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
     """Vehicles that stand."""
-    where = np.repeat(np.array(position, dtype=float)[None], steps, axis=0)
+    where = np.repeat(np.array(position, float)[None], steps, axis=0)
     return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
 
 
@@ -148,15 +150,15 @@ def among(many: Links, few: Links) -> Bools:
 def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None)) -> Recording:
     """The recording without a share of the fixes; the first ones stay."""
     gnss = recording.gnss.copy()
-    gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < share
+    gone = default_rng(5).uniform(size=gnss.shape[:3]) < share
     gone[:, 0] = False
-    gnss[:, :, vehicles][gone[:, :, vehicles]] = np.nan
+    gnss[:, :, vehicles][gone[:, :, vehicles]] = nan
     return replace(recording, gnss=gnss)
 
 
 def slow_fixes(recording: Recording, every: int = 10) -> Recording:
     """A fix at every so many steps: at 1 Hz in data of 10 Hz."""
-    gnss = np.where(np.arange(len(recording.t))[:, None, None] % every, np.nan, recording.gnss)
+    gnss = np.where(np.arange(len(recording.t))[:, None, None] % every, nan, recording.gnss)
     return replace(recording, gnss=gnss)
 
 

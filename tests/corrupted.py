@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy import inf, nan
 
 from coopoc import V2X, Fleet, InputError, Links, Recording, Sensors, observe
 from coopoc.methods.catalogue import METHODS
@@ -23,7 +24,7 @@ def drive(steps: int = 12, vehicles: int = 5) -> Fleet:
     place = np.c_[7.0 * np.arange(vehicles), 4.0 * (np.arange(vehicles) % 3), np.zeros(vehicles)]
     position = place + t[:, None, None] * velocity
     for array in (position, velocity):
-        array[:3, 3], array[9:, 4] = np.nan, np.nan
+        array[:3, 3], array[9:, 4] = nan, nan
     return Fleet(tuple("abcdefgh"[:vehicles]), t, position, velocity)
 
 
@@ -75,19 +76,19 @@ def wrong(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "neighbour is observer", {"neighbour": valid.links.observer}
     yield "arrival before sending", {"arrival": np.where(valid.arrival >= 0, valid.links.step - 1, -1)}
     yield "arrival far below", {"arrival": valid.arrival - 1000}
-    for name, value in (("gnss", np.inf), ("velocity", -np.inf), ("relative", np.inf), ("t", np.nan), ("t", np.inf)):
+    for name, value in (("gnss", inf), ("velocity", -inf), ("relative", inf), ("t", nan), ("t", inf)):
         bad = arrays(valid)[name].copy()
         bad.ravel()[3] = value
         yield f"{name} holds {value}", {name: bad}
     for name in ("gnss", "velocity"):
         bad = arrays(valid)[name].copy()
-        bad[0, 1, 0, 1] = np.nan
+        bad[0, 1, 0, 1] = nan
         yield f"{name} without y", {name: bad}
     absent = valid.velocity.copy()
-    absent[:, valid.links.step[0], valid.links.neighbour[0]] = np.nan
+    absent[:, valid.links.step[0], valid.links.neighbour[0]] = nan
     yield "a link to an absent vehicle", {"velocity": absent}
     once = valid.velocity.copy()
-    once[1, 4, 0] = np.nan
+    once[1, 4, 0] = nan
     yield "absent in one run", {"velocity": once}
     yield "negative range", {"relative": valid.relative * [-1, 1, 1]}
     yield "t backwards", {"t": valid.t[::-1]}
@@ -146,9 +147,9 @@ def allowed(valid: Recording, rng: np.random.Generator) -> Iterator[tuple[str, d
         parts: dict[str, Any] = {name: getattr(valid.links, name)[chosen] for name in COLUMNS}
         yield f"{size} links", {**parts, "relative": valid.relative[:, chosen], "arrival": valid.arrival[:, chosen]}
     for name, mask in (("gnss", (runs, *valid.gnss.shape[1:3], 1)), ("relative", (runs, links, 1))):
-        yield f"{name} at times", {name: np.where(rng.random(mask) < 0.3, np.nan, arrays(valid)[name])}
-    yield "never a fix", {"gnss": np.full_like(valid.gnss, np.nan)}
-    yield "no azimuth", {"relative": np.where([False, True, False], np.nan, valid.relative)}
+        yield f"{name} at times", {name: np.where(rng.random(mask) < 0.3, nan, arrays(valid)[name])}
+    yield "never a fix", {"gnss": np.full_like(valid.gnss, nan)}
+    yield "no azimuth", {"relative": np.where([False, True, False], nan, valid.relative)}
     yield "zero ranges", {"relative": valid.relative * [0, 1, 1]}
     yield "far away", {"gnss": valid.gnss + 1e7}
 

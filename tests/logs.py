@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.random import default_rng
+from numpy.random import Generator, default_rng
 
 from coopoc import V2X, Fleet, Recording, Sensors, observe
 
@@ -96,7 +96,7 @@ def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: 
     return noisy(default_rng(seed), t, name, {"range": (gap, std)}).assign(partner=other)
 
 
-def noisy(rng: np.random.Generator, t: Any, name: str, columns: dict[str, tuple[Any, float]]) -> pd.DataFrame:
+def noisy(rng: Generator, t: Any, name: str, columns: dict[str, tuple[Any, float]]) -> pd.DataFrame:
     """What one vehicle measures, in a wide table: kind -> (truth, std)."""
     measured = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
     return pd.DataFrame(

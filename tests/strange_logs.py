@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.random import default_rng
 
 KINDS: dict[str, tuple[int, float, float, float, float, float, tuple[float, ...]]] = {
     "drone": (4, 5.0, 15.0, 8.0, 0.5, 0.1, (5.0, 10.0, 5.0)),
@@ -28,7 +29,7 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
     """
     get = fault.get
     count, pace, apart, climb, fix, reach, rates = KINDS[kind]
-    rng, noise, t = np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.02 * np.arange(int(seconds * 50))
+    rng, noise, t = default_rng(seed), default_rng([seed, 1]), 0.02 * np.arange(int(seconds * 50))
     drones, cars, robots = (kind == name for name in KINDS)
     names, axes = [f"{kind}{k}" for k in range(count)], list("xyz" if drones else "xy")
     (begin, end), body = get("tunnel", (-1, -1)), "body" in fault

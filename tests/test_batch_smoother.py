@@ -60,8 +60,8 @@ def compare(known: str, recording: Recording):
         x, P = batch_smoother(recording, noise, run, held(recording.gnss[run]))
         for e, n in enumerate(egos):
             np.testing.assert_allclose(track.x[run, :, e], x[:, n], atol=1e-7, rtol=0)
-            size = np.abs(P[:, n]).max(axis=(-1, -2), keepdims=True)
-            assert (np.abs(track.covariance[run, :, e] - P[:, n]) / size).max() < 1e-6
+            size = abs(P[:, n]).max(axis=(-1, -2), keepdims=True)
+            assert (abs(track.covariance[run, :, e] - P[:, n]) / size).max() < 1e-6
 
 
 def held(gnss: Any) -> Any:
@@ -159,4 +159,4 @@ def test_who_hardly_moves_does_not_drown_the_rest(least, crossing):
     track = textbook(BatchSmoother(known))(recording, range(8))
     residual = problem(recording, known)
     best = solved(lambda x: residual(np.tile(x, 60)), track.x[0, 0].ravel())
-    assert np.abs(track.x[0] - best.x.reshape(8, 3)).max() < max(2e-3, 30 * least)
+    assert abs(track.x[0] - best.x.reshape(8, 3)).max() < max(2e-3, 30 * least)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import holed, slow_fixes, textbook, winding
+from numpy import nan
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, partial
@@ -70,7 +72,7 @@ def mean_errors(seen: Recording, fleet: Fleet, egos: Sequence[int], *others: Met
 
 def too_long(seen: Recording, share: float = 0.05) -> Recording:
     """Ranges as behind a corner."""
-    rng, relative = np.random.default_rng(1), np.array(seen.relative)
+    rng, relative = default_rng(1), np.array(seen.relative)
     hit = rng.random(relative.shape[:2]) < share
     relative[..., 0] += np.where(hit, rng.uniform(3, 20, hit.shape), 0)
     return replace(seen, relative=relative)
@@ -99,7 +101,7 @@ def test_wrong_ranges_cost_little_and_are_named():
     changed = wrong.relative[..., 0] - seen.relative[..., 0] > 8.0
     assert weights[changed].mean() < 0.1
     assert weights[~changed].mean() > 0.97
-    white = np.random.default_rng(0).normal(size=(4, 1000, 3))
+    white = default_rng(0).normal(size=(4, 1000, 3))
     twice = np.repeat(white, 2, axis=1)
     assert lasting("a", white, 1.0) == lasting("a", twice, 0.5) == []
     assert "correlated by 0.5" in lasting("a", twice, 1.0)[0]
@@ -128,7 +130,7 @@ def test_inclinations_alone_do_not_lose_the_ego():
     """Near a fix of 3.5 m they are not linear: taken for it they left vehicles 7 to 12 m off; Kalman is the referee."""
     fleet = load_fleet("town10").between(0, 200)
     seen = observe(fleet, S2, V2X(6), runs=6, seed=1, observers=[12, 24, 36])
-    flat = replace(seen, relative=np.where([False, False, True], seen.relative, np.nan))
+    flat = replace(seen, relative=np.where([False, False, True], seen.relative, nan))
     ours, alone = (rt_le(m(flat, [12, 24, 36]), fleet) for m in (CooperativeFilter(), Kalman()))
     assert ours.mean() < 1.05 * alone.mean()
     assert (ours < 2.0 * alone).all()
@@ -218,7 +220,7 @@ def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
     fleet, sensors = every(load_fleet("town10").between(0, 400), step), replace(S2, gnss_std=(1.0,) * 3)
     seen = slow_fixes(observe(fleet, sensors, V2X(most), runs=2, seed=3, observers=[24]), 10 // step)
     relative, late = seen.relative.copy(), 10 // step * (2 * len(wrong) if wrong[0] == 0 else 0)
-    relative[..., 1:] = np.nan
+    relative[..., 1:] = nan
     for off in (30.0, 600.0):
         off_then = moved(seen, 10 // step * np.array(wrong), 24, [0.8 * off, -0.6 * off, 0.0])
         for m in (Kalman(), JointFilter(), CooperativeFilter()):
@@ -253,7 +255,7 @@ def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
     seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=6, observers=[24]), 10 // step)
     gnss, relative, t = seen.gnss.copy(), seen.relative.copy(), fleet.t - fleet.t[0]
     gnss[:, :, 24, 0] += np.where((t >= 20) & (t < 40), 3.0 * (t - 20), 0.0)
-    relative[..., 1:] = np.nan
+    relative[..., 1:] = nan
     track = CooperativeFilter(priors=priors)(replace(seen, gnss=gnss, relative=relative), [24])
     assert errors(track, fleet)[:, 500 // step :].mean() < 1.8
 
@@ -295,7 +297,7 @@ def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):
     seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=3, observers=[ego]), 2)
     signs = np.where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
     velocity = seen.velocity * signs if reverse else seen.velocity + np.array([3.0, 0.0, 0.0])
-    ranges = np.where([True, False, False], seen.relative, np.nan)
+    ranges = np.where([True, False, False], seen.relative, nan)
     track = CooperativeFilter(priors=ON_ROADS)(replace(seen, velocity=velocity, relative=ranges), [ego])
     assert errors(track, fleet)[:, 100:].mean() < 2.5
 
@@ -353,7 +355,7 @@ def test_a_lost_message_costs_no_more_than_the_message():
 
 def mirrored(recording: Recording) -> Recording:
     """Ranges in another unit, azimuths of another sign; a fix of the ego each second."""
-    seldom = moved(recording, np.arange(len(recording.t)) % 10 > 0, 0, np.nan)
+    seldom = moved(recording, np.arange(len(recording.t)) % 10 > 0, 0, nan)
     return replace(seldom, relative=recording.relative * [2.0, -1.0, 1.0])
 
 
@@ -367,7 +369,7 @@ def failing(recording: Recording) -> Recording:
 def tunnel(recording: Recording) -> Recording:
     """At first no vehicle has a fix, then for a while all but the ego."""
     gnss = recording.gnss.copy()
-    gnss[:, :3] = gnss[:, :25, 0] = np.nan
+    gnss[:, :3] = gnss[:, :25, 0] = nan
     return replace(recording, gnss=gnss)
 
 
@@ -439,7 +441,7 @@ def test_step_by_step_it_is_the_track(crossing, case):
         streams[0] = pickle.loads(pickle.dumps(streams[0]))
         x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
         assert_allclose(x, track.x[0, t, 0], atol=1e-6)
-        assert_allclose(np.full((3, 3), np.nan) if cov is None else cov, track.covariance[0, t, 0], atol=1e-6)
+        assert_allclose(np.full((3, 3), nan) if cov is None else cov, track.covariance[0, t, 0], atol=1e-6)
         trusted |= set(streams[0].trusted.values())
     assert np.isfinite(track.x[:, 24 if case == "tunnel" else 0 :]).all()
     assert trusted == ({True} if case == "lost" else {True, False})
@@ -521,7 +523,7 @@ def test_clocks_of_neighbours_are_found(priors):
     links = np.concatenate([late.links.of(ego) for ego in (0, 7)])
     known, wrong = late.links.step[links] > 150, np.isin(late.links.neighbour[links], who)
     assert 0.2 < np.median(found.extras["clock"][:, known & wrong]) < 0.6
-    assert np.percentile(np.abs(found.extras["clock"][:, known & ~wrong]), 90) < 1e-3
+    assert np.percentile(abs(found.extras["clock"][:, known & ~wrong]), 90) < 1e-3
     assert any(note.startswith("clock, ") and note.endswith("ahead, or its messages are late") for note in found.notes)
     assert not any(note.startswith("clock, ") for note in usual.notes)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from numpy import pi
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from shell import ran
@@ -29,7 +30,7 @@ STD = {"speed": 0.05, "yaw_rate": 0.01, "x": 0.5, "y": 0.5, "range": 0.1, "beari
 
 
 def wrapped(angle: Any) -> Any:
-    return np.mod(np.asarray(angle) + np.pi, 2 * np.pi) - np.pi
+    return np.mod(np.asarray(angle) + pi, 2 * pi) - pi
 
 
 def drives() -> dict[str, tuple[Any, Any, float, float]]:
@@ -38,7 +39,7 @@ def drives() -> dict[str, tuple[Any, Any, float, float]]:
     for name, (start, radius, rate) in CARS.items():
         angle = start + rate * T
         place = radius * np.c_[np.cos(angle), np.sin(angle)]
-        out[name] = place, wrapped(angle + np.pi / 2), radius * rate, rate
+        out[name] = place, wrapped(angle + pi / 2), radius * rate, rate
     return out
 
 
@@ -145,7 +146,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
     begin[columns] = [[*place[0], 0.0, heading[0]] for place, heading, _, _ in drives().values()]
     track = replace(co.PoseFilter("fleet"), begin=begin)(log.recording, list(CARS))
     truth = np.stack([place for place, _, _, _ in drives().values()], axis=1)
-    assert np.abs(track.x[0, ..., :2] - truth).max() < 0.1
+    assert abs(track.x[0, ..., :2] - truth).max() < 0.1
 
 
 @pytest.mark.parametrize(
@@ -295,7 +296,7 @@ def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:
     (folder / "Hall_Input.txt").write_text("\n".join([*measured, "imu 0.0 1 2 3"]))
     (folder / "Hall_GT.txt").write_text("\n".join(true))
     (folder / "readme.txt").write_text("Not a measurement.")
-    return place, wrapped(angle + np.pi / 2)
+    return place, wrapped(angle + pi / 2)
 
 
 @pytest.mark.parametrize("wheels", [True, False])
@@ -312,7 +313,7 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path, wheels):
     begin = co.pose_start(log.recording)
     track = co.PoseFilter("solo", begin=begin)(log.recording, ["Hall"])
     assert norm(track.x[0, 50:, 0, :2] - place[50:], axis=1).max() < 0.15
-    assert np.abs(wrapped(track.heading[0, 50:, 0] - heading[50:])).max() < 0.05
+    assert abs(wrapped(track.heading[0, 50:, 0] - heading[50:])).max() < 0.05
     with refused("where ranges to anchors place it"):
         co.read_log(tmp_path / "hall")
 
@@ -332,15 +333,15 @@ def test_ranges_are_moved_to_their_step(tmp_path):
 def test_ranges_and_bearings_are_moved_to_their_step_without_a_place(tmp_path):
     """Closed form: on a circle of 30 m at 12 m/s, what a car measures of a mast 0.05 s after a step."""
     t, turn = np.arange(90) / 10, 0.4j
-    mast, mean = 50 + 9j, np.sinc(0.02 / np.pi)  # speeds are that of a chord
+    mast, mean = 50 + 9j, np.sinc(0.02 / pi)  # speeds are that of a chord
     at = [(mast + 30j * np.exp(turn * when)) * np.exp(-turn * when) for when in (t, t + 0.05)]
-    seen = pd.DataFrame({"t": t + 0.05, "partner": "mast", "range": np.abs(at[1]), "bearing": np.angle(at[1])})
+    seen = pd.DataFrame({"t": t + 0.05, "partner": "mast", "range": abs(at[1]), "bearing": np.angle(at[1])})
     own = pd.DataFrame({"t": t, "speed": 12 * mean, "yaw_rate": 0.4})
     places = pd.DataFrame({"t": [0.0], "vehicle": "mast", "x": 50.0, "y": 9.0})
     pd.concat([own.assign(vehicle="a"), seen.assign(vehicle="a"), places]).query("t < 3").to_csv(tmp_path / "log.csv")
     rec = co.read_log(tmp_path / "log.csv", frame="body", dt=0.1).recording
     there = at[0][rec.links.step]
-    assert_allclose(rec.relative[0, :, :2], np.column_stack([np.abs(there), np.angle(there)]), atol=0.01)
+    assert_allclose(rec.relative[0, :, :2], np.column_stack([abs(there), np.angle(there)]), atol=0.01)
 
 
 def test_two_anchors_leave_the_side_open(tmp_path):
@@ -366,5 +367,5 @@ def test_wheels_of_another_size_cost_little_from_a_known_pose(tmp_path, share):
         tracks = made(log.recording, both), replace(made, assumed=told)(log.recording, both)
         found[wheels] = [co.rt_le(track, log.truth).mean() for track in tracks]
         scale, std = (tracks[0].extras[name][0, -1] for name in ("speed_scale", "speed_scale_std"))
-        assert (np.abs(scale - wheels) < 4 * std).all()
+        assert (abs(scale - wheels) < 4 * std).all()
     assert found[share][0] < 1.3 * found[0.0][0] < 0.5 * found[share][1]

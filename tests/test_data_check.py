@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from logs import bends, drive, fixes, motion, noisy, outliers, ranges, write
+from numpy import nan, pi
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
@@ -204,13 +205,13 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
     moves = (t < 30) | (t >= 60)
     x = np.cumsum(np.where(moves, 1.6, 0.0))
     frame = pd.DataFrame({"t": t, "vehicle": "car", "x": x, "y": 0.0, "speed": np.where(moves, 8.0, 0.02)})
-    frame["heading"] = np.where(moves, 0.0, np.nan)
+    frame["heading"] = np.where(moves, 0.0, nan)
     log = read_log(write(frame, tmp_path / "car.csv"))
     assert np.isfinite(log.recording.gnss[0, :, 0, 0]).all()
     assert not log.summary.refused
     still = ~moves & (t > 31)
     assert_allclose(log.recording.velocity[0, still, 0], 0.0, atol=0.03)
-    frame.loc[~moves, "speed"] = np.nan  # a receiver that says nothing while it stands
+    frame.loc[~moves, "speed"] = nan  # a receiver that says nothing while it stands
     text = said(read_log(write(frame, tmp_path / "car.csv")))
     assert "mostly 14" in text
     assert "fixes in gaps of the odometry" in text
@@ -282,7 +283,7 @@ def turned_drive(folder: Path, speed: Any, turn: float, seconds: float = 120.0) 
     heading = np.cumsum(0.01 * v * 0.04)
     x, y = np.cumsum(v * np.cos(heading)) * 0.04, np.cumsum(v * np.sin(heading)) * 0.04
     fixed = np.arange(len(t)) % 25 == 0
-    seen = [np.where(fixed, at + rng.normal(0, 1.0, len(t)), np.nan) for at in (x, y)]
+    seen = [np.where(fixed, at + rng.normal(0, 1.0, len(t)), nan) for at in (x, y)]
     odometry = {"speed": v * rng.normal(1, 0.02, len(t)), "heading": np.angle(np.exp(1j * (heading + turn)))}
     write(pd.DataFrame({"t": t, "vehicle": "a", "x": seen[0], "y": seen[1], **odometry}), folder / "log.csv")
     write(pd.DataFrame({"t": t, "vehicle": "a", "x": x, "y": y})[::5], folder / "truth.csv")
@@ -293,8 +294,8 @@ def turned_drive(folder: Path, speed: Any, turn: float, seconds: float = 120.0) 
     ("speed", "turn", "words"),
     [
         (lambda t: 0 * t + 10, 0.05, r"(?!(.|\n)*behind)(.|\n)*its odometry is turned by 2\."),
-        (lambda t: 10 * np.sin(t * np.pi / 20).clip(0), 0.05, r"(.|\n)*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
-        (lambda t: 10 + 4 * np.sin(t / 2), np.pi, r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*$"),
+        (lambda t: 10 * np.sin(t * pi / 20).clip(0), 0.05, r"(.|\n)*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
+        (lambda t: 10 + 4 * np.sin(t / 2), pi, r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*$"),
     ],
 )
 def test_odometry_that_is_turned_is_nothing_else(tmp_path, speed, turn, words):

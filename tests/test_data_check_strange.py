@@ -202,7 +202,7 @@ def test_a_hundred_anchors_are_read_without_a_word(tmp_path):
     """pandas warned of frames with more than a hundred columns, once for each of them."""
     rng, t = default_rng(2), np.arange(0, 40, 0.5)
     x, places = 10 * np.exp(0.1j * t), 20 * rng.uniform(-1, 1, (2, 110))
-    ranges = np.abs(x[:, None] - places[0] - 1j * places[1]) + rng.normal(0, 0.01, (len(t), 110)) + 0.05
+    ranges = abs(x[:, None] - places[0] - 1j * places[1]) + rng.normal(0, 0.01, (len(t), 110)) + 0.05
     table = {"x": x.real, "y": x.imag} | {f"range_m{k}": each for k, each in enumerate(ranges.T)}
     pd.DataFrame({"t": t, "vehicle": "a", **table}).to_csv(tmp_path / "log.csv")
     marks = pd.DataFrame({"vehicle": [f"m{k}" for k in range(110)], "x": places[0], "y": places[1]})

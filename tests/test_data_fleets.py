@@ -69,7 +69,7 @@ def test_town04_is_hilly():
     gap = fleet.position[:, None] - fleet.position[:, :, None]
     distance = norm(gap, axis=-1)
     near = (distance < 30) & (distance > 0)
-    elevation = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
+    elevation = np.degrees(np.arcsin(abs(gap[..., 2][near] / distance[near])))
     assert np.mean(elevation > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
 
 
@@ -78,7 +78,7 @@ def test_fleets_are_disjoint():
         assert not set(one.ids) & set(other.ids)
         steps = min(len(one.t), len(other.t), 900)
         for x in np.moveaxis(one.position[:steps], 1, 0):
-            same = np.abs(other.position[:steps] - x[:, None]).max(axis=2) < 0.5
+            same = abs(other.position[:steps] - x[:, None]).max(axis=2) < 0.5
             assert same.mean(axis=0).max() < 0.5, "no vehicle drives where one of another fleet drives"
 
 

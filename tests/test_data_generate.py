@@ -9,6 +9,7 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 from conftest import measured, refused
+from numpy import pi
 from scipy import signal
 from scipy.spatial import cKDTree
 from shell import ROOT
@@ -67,7 +68,7 @@ def test_elevation_is_that_of_the_map():
             points.append([float(g.attrib["x"]), float(g.attrib["y"]), a + along * (b + along * (c + along * d))])
     lines, x = np.array(points), bundled("town04").position[::10].reshape(-1, 3)
     near = cKDTree(lines[:, :2]).query_ball_point(x[:, :2], 12.0)
-    error = [np.abs(lines[index, 2] - z).min() for index, z in zip(near, x[:, 2], strict=True) if index]
+    error = [abs(lines[index, 2] - z).min() for index, z in zip(near, x[:, 2], strict=True) if index]
     assert len(error) > 1000, "positions beside the start of a piece of a reference line"
     assert np.percentile(error, 95) < 0.6
     assert np.ptp([z for index, z in zip(near, x[:, 2], strict=True) if index]) > 10
@@ -77,16 +78,16 @@ def test_smoothing_halves_the_cutoff_and_keeps_slow_motion():
     """Closed form of the gain, 1/(1 + (f/fc)^6), and the frequency response of sin by its amplitude."""
     t = np.arange(2000) * 0.1
     for f, gain in ((0.05, 1.0), (0.5, 0.5), (1.0, 1 / (1 + 2.0**6))):
-        out = smooth(np.sin(2 * np.pi * f * t), 0.1, 0.5)[500:1500]
+        out = smooth(np.sin(2 * pi * f * t), 0.1, 0.5)[500:1500]
         window = signal.windows.hann(1000)
-        amplitude = 2 * abs(np.sum(window * out * np.exp(-2j * np.pi * f * t[500:1500]))) / window.sum()
+        amplitude = 2 * abs(np.sum(window * out * np.exp(-2j * pi * f * t[500:1500]))) / window.sum()
         assert amplitude == pytest.approx(gain, abs=0.03)
 
 
 def test_smoothing_solves_the_penalised_least_squares():
     """Independent check: numpy.linalg.lstsq on the stacked problem."""
     x = np.random.default_rng(0).normal(size=(40, 3))
-    weight = (2 * np.pi * 0.5 * 0.1) ** -3
+    weight = (2 * pi * 0.5 * 0.1) ** -3
     stacked = np.vstack([np.eye(40), weight * np.diff(np.eye(40), n=3, axis=0)])
     expected = np.linalg.lstsq(stacked, np.vstack([x, np.zeros((37, 3))]), rcond=None)[0]
     np.testing.assert_allclose(smooth(x, 0.1, 0.5), expected, atol=1e-9)

@@ -10,6 +10,7 @@ import pymap3d
 import pytest
 from conftest import refused
 from logs import NOISE, at, drive, fixes, long, motion, observed, ranges, write
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
 
@@ -169,7 +170,7 @@ def test_a_good_receiver_is_weighed_as_it_states(tmp_path):
     parts += [ranges(fleet, *fleet.ids, 0.1, 0.3), *(motion(fleet, name, 0.1, 0.3) for name in fleet.ids)]
     rec = read_log(write(pd.concat(parts), tmp_path / "log.csv")).recording
     for method in (co.Kalman(), co.CooperativeFilter()):
-        assert np.abs(method(rec).x[0, :, 0] - at(fleet, "car0", rec.t)).mean() < 0.1
+        assert abs(method(rec).x[0, :, 0] - at(fleet, "car0", rec.t)).mean() < 0.1
 
 
 def test_a_clock_that_is_ahead_is_set_back(tmp_path):
@@ -207,7 +208,7 @@ def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path):
 def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
     """Closed form: eight cars at 10 m/s on bends, headings of 0.05 rad every 0.4 s; NEES is 2 in a plane if consistent,
     and was 43 with the noise of the speeds alone."""
-    rng, rows, truth = np.random.default_rng(8), [], []
+    rng, rows, truth = default_rng(8), [], []
     t = np.round(np.arange(0, 60, 0.1), 1)
     for car in range(8):
         turn = 0.2 * np.sin(0.3 * t + car)
@@ -236,7 +237,7 @@ MAST = np.array([40.0, 60.0])
 
 def straight(t: Any) -> dict[str, Any]:
     """Two cars that pass each other at 25 m/s."""
-    here = np.asarray(t, dtype=float)
+    here = np.asarray(t, float)
     return {"east": np.array([15 * here - 100, 0 * here]), "west": np.array([60 - 10 * here, 4 + 0 * here])}
 
 
@@ -299,7 +300,7 @@ def test_bearings_in_body_frames_turn_with_the_car(tmp_path, late):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_mean_over_a_step_is_that_over_its_halves(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     signal = Signal(np.cumsum(rng.uniform(0.01, 1.0, 9)), rng.uniform(-1e6, 1e6, (9, 1)))
     halves = step_means(signal, 0.15 * np.arange(-1, 17))[:, 0]
     whole = step_means(signal, 0.3 * np.arange(9))[:, 0]

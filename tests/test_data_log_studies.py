@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from logs import bends, drive, fixes, long, motion, observed, ranges, write
+from numpy import nan, pi
 from numpy.testing import assert_allclose
 from oracles.solo import filterpys
 
@@ -72,7 +73,7 @@ def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders):
     assert found["max_error_m"].item() == pytest.approx(every.max())
     assert found["sent_bytes_per_second"].item() == pytest.approx(sent / (len(every) * log.recording.dt))
     gnss = log.recording.gnss.copy()
-    gnss[:, :, 2] = gnss[:, 0, 1] = np.nan
+    gnss[:, :, 2] = gnss[:, 0, 1] = nan
     with refused("car2.*is never present at two successive steps"):
         method(replace(log.recording, gnss=gnss), ["car1", "car2"])
 
@@ -120,7 +121,7 @@ def test_ranges_help_or_do_no_harm(tmp_path, options, offset, most):
     path = write(table.assign(range=table["range"] + offset), tmp_path / "cars.csv")
     log = load_log(f"{path}{options}")
     true = np.stack([[np.interp(log.recording.t, fleet.t, x) for x in p.T] for p in fleet.position.swapaxes(0, 1)])
-    without = replace(log.recording, relative=np.full_like(log.recording.relative, np.nan))
+    without = replace(log.recording, relative=np.full_like(log.recording.relative, nan))
     tracks = [co.CooperativeFilter()(seen, fleet.ids) for seen in (log.recording, without)]
     tracks.append(co.Kalman()(without, fleet.ids))
     rms = [np.sqrt(np.square(track.x[0] - true.transpose(2, 0, 1))[..., :2].mean()) for track in tracks]
@@ -210,7 +211,7 @@ WRONG = {
     "positions in km": (["x", "y"], lambda v: v / 1000, r"are positions in km\?"),
     "azimuths clockwise from north": (
         ["azimuth"],
-        lambda v: (np.pi / 2 - v) % (2 * np.pi),
+        lambda v: (pi / 2 - v) % (2 * pi),
         r"azimuths miss.*clockwise from north",
     ),
     "ranges in feet": (

@@ -12,6 +12,7 @@ import pytest
 from conftest import refused
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
+from numpy import nan
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -57,10 +58,10 @@ def log(
     """A log of noisy fixes at some of the steps, and of what else is measured at all of them; times and fixes."""
     x, rng = path(name), default_rng(seed)
     k = np.array(steps) if len(steps) else np.arange(0, len(T), every)
-    z, std = np.full_like(x, np.nan), np.broadcast_to(std, x.shape)
+    z, std = np.full_like(x, nan), np.broadcast_to(std, x.shape)
     z[k] = x[k] + rng.normal(0, std[k])
     drive = pd.DataFrame(z, columns=[*"xyz"]).assign(t=T, vehicle="a", **more)
-    drive[["x_std", "y_std", "z_std"]] = np.where(np.isfinite(z), std, np.nan)
+    drive[["x_std", "y_std", "z_std"]] = np.where(np.isfinite(z), std, nan)
     folder.mkdir(parents=True, exist_ok=True)
     drive[drive[["x", *more]].notna().any(axis=1)].to_csv(folder / "a.csv", index=False)
     pd.DataFrame(x, columns=[*"xyz"]).assign(t=T, vehicle="a").to_csv(folder / "truth.csv", index=False)
@@ -203,7 +204,7 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     assert any(note.startswith("odometry, a: fails") for note in notes)
     coarse = co.read_log(tmp_path / "gyro", dt=0.5).recording
     pace = norm(coarse.velocity[0, 1:, 0], axis=1)
-    assert np.nanmax(np.abs(pace - np.interp(coarse.t[1:], T, speed))) < 1.5
+    assert np.nanmax(abs(pace - np.interp(coarse.t[1:], T, speed))) < 1.5
 
 
 @pytest.mark.parametrize("std", [0.05, 1.5])
@@ -265,12 +266,12 @@ def test_a_gap_splits_a_drive_in_every_method(tmp_path):
         assert np.isfinite(co.max_error(track, truth)).all()
         assert any("no estimate there" in note for note in track.notes)
     with refused("absent"):
-        co.Kalman()(replace(rec, velocity=np.nan * rec.velocity))
+        co.Kalman()(replace(rec, velocity=nan * rec.velocity))
 
 
 def test_hills_are_followed_by_fixes_that_are_denser_than_odometry(tmp_path):
     """Without a vertical velocity a height erred by 6 m; at steps of the odometry nine of ten fixes were lost."""
-    seldom = np.where(np.arange(len(T)) % 10, np.nan, 1.0)
+    seldom = np.where(np.arange(len(T)) % 10, nan, 1.0)
     read = log(tmp_path / "log", "hill", 1.5, 1, speed=SPEED * seldom, heading=COURSE * seldom)[0]
     assert read.recording.dt == 0.1
     assert error(read, co.Kalman()) < 0.3 * error(read, co.GNSS())
@@ -318,8 +319,8 @@ def test_numbers_that_stand_for_none_are_none(tmp_path, what):
     rows = pd.read_csv(tmp_path / "a.csv")
     NONE[what](rows, rows["t"].between(100, 114)).to_csv(tmp_path / "a.csv")
     read = co.read_log(tmp_path)
-    assert np.nanmax(np.abs(read.recording.gnss[0] - read.truth.position)) < 6.0
-    assert np.nanmax(np.abs(read.recording.velocity)) < 20.0
+    assert np.nanmax(abs(read.recording.gnss[0] - read.truth.position)) < 6.0
+    assert np.nanmax(abs(read.recording.velocity)) < 20.0
     assert read.recording.sensors.fix_std[0] == pytest.approx(1.0)
 
 
@@ -330,7 +331,7 @@ def test_fixes_that_are_held_are_a_gap_where_nothing_else_moves(tmp_path, held):
     rows = pd.read_csv(tmp_path / "a.csv")
     part = rows["t"].between(120, 150)
     columns = ["x", "y", "z"] if held else ["yaw_rate"]
-    rows.loc[part, columns] = rows.loc[~part & rows["t"].lt(120), columns].iloc[-1].to_numpy() if held else np.nan
+    rows.loc[part, columns] = rows.loc[~part & rows["t"].lt(120), columns].iloc[-1].to_numpy() if held else nan
     rows.to_csv(tmp_path / "a.csv")
     read = co.read_log(tmp_path)
     assert np.isnan(read.recording.velocity[0, :, 0, 0])[np.searchsorted(read.recording.t, [130.0, 140.0])].all()

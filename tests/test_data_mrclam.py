@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import measured, refused
+from numpy.linalg import norm
 from scipy.linalg import lstsq
 
 import coopoc as co
@@ -63,7 +64,7 @@ def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen):
 def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened():
     """Closed form: sums of n terms of an autoregression have variance n s^2 (1 + c) / (1 - c) (Bartlett 1946)."""
     normals, t = np.random.default_rng(0).standard_normal((200_000, 1)), np.arange(200_000) * 0.1
-    c, lasting, robot = np.exp(-0.2), gauss_markov(normals, 0.2), np.zeros(len(t), dtype=np.int64)
+    c, lasting, robot = np.exp(-0.2), gauss_markov(normals, 0.2), np.zeros(len(t), int)
     for gate in (np.inf, ROBUST):
         assert grouped(normals[:, 0], robot, t, gate) == pytest.approx(1.0, rel=0.05)
         assert grouped(lasting[:, 0], robot, t, gate) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
@@ -77,7 +78,7 @@ def test_odometry_follows_its_log_late_and_slower_in_turns(log, known):
     assert abs(known.lag - 0.1 * int(np.argmax(late))) <= 0.1
     wheel, turning = (np.interp(log.fleet.t - known.lag, log.fleet.t, v[:, 0]) for v in (log.speed, log.turn_rate))
     way = turned(log.fleet.velocity[:, 0], -midway(log.heading)[:, 0])[:, 0]
-    sums = np.c_[way, wheel, wheel * np.abs(turning)][1:7501].reshape(-1, 50, 3).sum(axis=1)
+    sums = np.c_[way, wheel, wheel * abs(turning)][1:7501].reshape(-1, 50, 3).sum(axis=1)
     ahead, lost = lstsq(sums[:59, 1:], sums[:59, 0])[0]
     assert (known.speed[0], known.slip[0]) == pytest.approx((ahead, -lost / ahead), rel=0.01)
     slope = lstsq(sums[:59, 1:2], sums[:59, 0])[0][0]
@@ -100,8 +101,8 @@ def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_sta
 def test_first_poses_are_found_from_what_is_seen(log, seen):
     """Vicon's poses, which the start does not know; bearings alone show none."""
     begin = co.pose_start(seen)
-    assert np.abs(np.angle(np.exp(1j * (begin[0, :5, 3] - log.heading[0])))).max() < np.deg2rad(20)
-    assert np.linalg.norm(begin[0, :5, :2] - log.fleet.position[0, :, :2], axis=1).max() < 1.5
+    assert abs(np.angle(np.exp(1j * (begin[0, :5, 3] - log.heading[0])))).max() < np.deg2rad(20)
+    assert norm(begin[0, :5, :2] - log.fleet.position[0, :, :2], axis=1).max() < 1.5
     with refused("three ranges"):
         co.pose_start(replace(seen, relative=seen.relative * [np.nan, 1.0, 1.0]))
     with refused("sees too little"):
@@ -176,7 +177,7 @@ def test_real_measurements_have_the_stated_noise(log):
     residuals = error[:, 0], wrap(error[:, 1])
     for residual, std, atol in zip(residuals, (0.095, 0.007), (0.0015, 0.0006), strict=True):
         assert robust_std(residual) == pytest.approx(std, abs=atol)
-        outliers = np.abs(residual - np.median(residual)) > 5 * robust_std(residual)
+        outliers = abs(residual - np.median(residual)) > 5 * robust_std(residual)
         assert 0.001 < outliers.mean() < 0.05, "rare"
 
 
@@ -198,8 +199,8 @@ def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log):
     absent = (~fleet.present).sum(axis=0)
     assert absent[[0, 1, 2, 4]].tolist() == [0, 0, 0, 0]
     assert 15 <= absent[3] <= 30, "a gap of 2 s (and one of 0.55 s)"
-    assert np.nanmax(np.abs(fleet.position[..., 2])) == 0
-    assert 0.03 < np.nanmean(np.linalg.norm(fleet.velocity, axis=2)) < 0.08
+    assert np.nanmax(abs(fleet.position[..., 2])) == 0
+    assert 0.03 < np.nanmean(norm(fleet.velocity, axis=2)) < 0.08
 
 
 def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:

@@ -17,6 +17,7 @@ from conftest import measured, refused
 from fuzz.good_files import sentence
 from logs import drive
 from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 import coopoc as co
@@ -150,7 +151,7 @@ def test_a_bag_is_read(tmp_path, ros):
     assert np.isfinite(co.read_log(path, dt=0.1).recording.gnss[0, :, :, 0]).sum() == 80 * 2
     file = path if ros == 1 else next(path.glob("*.db3"))
     whole = file.read_bytes()
-    for at in np.random.default_rng(0).integers(len(whole), size=8):
+    for at in default_rng(0).integers(len(whole), size=8):
         file.write_bytes(whole[:at] + b"\xff" * 8 + whole[at + 8 :])
         with suppress(co.InputError):
             read_log(path)
@@ -172,7 +173,7 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):
     course = np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0])
     assert_allclose(actual.heading[:, 0], course, atol=1e-6)
     body = read_log(path, dt=0.1, ignore=["/car0/pose", "/car1/imu"], frame="body").recording.body
-    assert np.abs(body.yaw_rate[0]).max(axis=0) == pytest.approx([0.06, 0.0], abs=1e-3)
+    assert abs(body.yaw_rate[0]).max(axis=0) == pytest.approx([0.06, 0.0], abs=1e-3)
     stands = read_log(path, dt=0.1, ignore=["/car0/pose"], truth="/car1/odom", origin=(48.14, 11.58, 560.0)).truth
     assert not stands.position[:, 1].any()  # that of its poses, which the test left at zero
     for wrong, match in (({"truth": "/car0/poses"}, "Did you mean /car0/pose"), ({"kinds": {"a": "x"}}, "to tables")):
@@ -198,7 +199,7 @@ def test_motion_capture_and_radios_of_a_public_bag():
     way = {name: np.array(raw[f"/vrpn_client_node/{name}/pose"]) for name in recording.ids}
     one = way["turtlebot1"]
     k = recording.ids.index("turtlebot1")
-    near = np.array([np.abs(one[:, 1:] - fix).sum(axis=1).min() for fix in recording.gnss[0, 100:200, k]])
+    near = np.array([abs(one[:, 1:] - fix).sum(axis=1).min() for fix in recording.gnss[0, 100:200, k]])
     assert np.nanmax(near) < 1e-5  # a fix is brought to its step
     errors = []
     for topic, rows in raw.items():
@@ -299,7 +300,7 @@ def test_a_damaged_bag_is_named(tmp_path, ros):
     pytest.importorskip("rosbags")
     path = tmp_path / ("drive.bag" if ros == 1 else "drive")
     write_bag(path, drive(2).between(0, 12), ros)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     for file in [path] if ros == 1 else sorted(path.iterdir()):
         good = file.read_bytes()
         for _ in range(60):

@@ -9,6 +9,8 @@ import pandas as pd
 import pymap3d
 import pytest
 from conftest import measured, refused
+from numpy import nan
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pyarrow.parquet import read_metadata
 
@@ -193,7 +195,7 @@ def test_interpolation_agrees_with_pandas():
     series = pd.Series(np.sin(t - 1.7e9), index=np.round(t - 1.7e9, 3))
     union = series.reindex(np.union1d(series.index, np.round(grid - 1.7e9, 3))).interpolate("index")
     wanted = union.reindex(np.round(grid - 1.7e9, 3)).to_numpy(copy=True)
-    wanted[(grid - 1.7e9 > 0.2001) & (grid - 1.7e9 < 0.8999)] = np.nan
+    wanted[(grid - 1.7e9 > 0.2001) & (grid - 1.7e9 < 0.8999)] = nan
     assert_allclose(interpolate(t, series.to_numpy()[:, None], grid, 0.5)[:, 0], wanted, atol=1e-6)
 
 
@@ -237,7 +239,7 @@ def test_a_row_that_is_none_is_named(tmp_path, row, message):
 def test_damaged_tables_are_named(tmp_path):
     drive(np.arange(50) / 10).to_parquet(tmp_path / "a.parquet")
     whole = (tmp_path / "a.parquet").read_bytes()
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     for _ in range(60):
         at = int(rng.integers(len(whole)))
         (tmp_path / "a.parquet").write_bytes(
@@ -300,12 +302,12 @@ def test_a_real_robot_of_libRSF():
 
 def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path):
     """NumPy: mean of both wheels along either heading, the rms of an axis, all fixes."""
-    torch, rng, drives = pytest.importorskip("torch"), np.random.default_rng(3), []
+    torch, rng, drives = pytest.importorskip("torch"), default_rng(3), []
     for date, steps in (("2013-01-10", 90), ("2013-02-23", 60)):
         heading = np.linspace(0.0, 3.0, steps)
         way = np.cumsum(1.2 * np.c_[np.cos(heading), np.sin(heading)], axis=0)
         gps = way + rng.normal(0.0, 3.0, way.shape)
-        gps[20:25] = np.nan
+        gps[20:25] = nan
         imu = np.c_[0 * heading, 0 * heading, heading + 0.1, 0 * heading]
         arrays = {"filtered_gps": gps, "filtered_wheel": np.tile([1.1, 1.3], (steps, 1)), "imu_sensor": imu}
         arrays |= {"theta_gt": heading[:, None], "ground_truth": way, "initial_state": np.zeros(6)}
@@ -329,12 +331,12 @@ def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path):
         ("global_pose/frame_times", None, "global_pose/frame_times = "),
         ("global_pose/frame_positions", b"PK no array", "must be an array of numpy.save"),
         ("processed_log/CAN/speed/value", b"cut", "must be an array of numpy.save"),
-        ("processed_log/CAN/speed/value", np.full((600, 1), np.nan), "not finite"),
+        ("processed_log/CAN/speed/value", np.full((600, 1), nan), "not finite"),
         ("processed_log/CAN/speed/value", np.zeros((600, 2)), r"\(600, 2\): must be \(600, 1\)"),
         ("processed_log/CAN/speed/t", np.zeros((600, 2)), "as its times"),
         ("processed_log/CAN/speed/t", np.zeros(0), "must be an array of numpy.save"),
         ("processed_log/CAN/speed/t", np.float64(3.0), "must be an array of numpy.save"),
-        ("processed_log/GNSS/live_gnss_ublox/value", np.array([[{}] * 6], dtype=object), "must be an array"),
+        ("processed_log/GNSS/live_gnss_ublox/value", np.array([[{}] * 6], object), "must be an array"),
         ("processed_log/GNSS/live_gnss_ublox/t", np.array(["a"] * 600), "must be an array"),
         ("processed_log/GNSS/live_gnss_ublox/t", b"huge", "must be an array of numpy.save"),
     ],

@@ -80,7 +80,7 @@ def assert_equivariant(
     assert_allclose(there.x, here.x @ change.matrix.T + change.shift, rtol=0, atol=near)
     if here.covariance is not None:
         turned = change.matrix @ here.covariance @ change.matrix.T
-        assert_allclose(there.covariance, turned, rtol=0, atol=10 * near * np.abs(turned).max())
+        assert_allclose(there.covariance, turned, rtol=0, atol=10 * near * abs(turned).max())
         nis = normalised_innovations(here, rec), normalised_innovations(there, change.of(rec))
         assert_allclose(*nis, rtol=0, atol=100 * near)
     if here.heading is not None:

@@ -66,7 +66,7 @@ def test_a_judge_learns_its_targets():
     def loss(weights, head):
         every = np.tile(rows[head], (star.HEADS, 1, 1))
         found = judge.logarithms(*map(judge.torch.from_numpy, (weights.astype(np.float32), every[:, :, :-1])))
-        return float(np.abs(found[head].numpy() - every[head, :, -1]).mean())
+        return float(abs(found[head].numpy() - every[head, :, -1]).mean())
 
     for head in (star.OWN, star.MOTION):
         assert loss(after, head) < loss(before, head)

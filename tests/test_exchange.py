@@ -25,7 +25,7 @@ def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_r
             gap = [float(np.sqrt(np.square(p - position[observer]).sum())) for p in position]
             fits = [(d, k) for k, d in enumerate(gap) if k != observer and min_range <= d <= radius]
             rows += [(t, observer, k) for _, k in sorted(fits)[:most]]
-    columns = np.array(rows, dtype=np.int64).reshape(-1, 3).T
+    columns = np.array(rows, int).reshape(-1, 3).T
     return Links(*columns)
 
 
@@ -77,11 +77,11 @@ def test_a_measurement_counts_by_a_message_of_either_way(formation):
     """A share of 0.3 of the messages is lost; measured both ways, 0.09 of the pairs get no message."""
     fleet = formation.between(0, 200)
     lossy = observe(fleet, S2, V2X(max_neighbours=len(fleet.ids), radius=1e3, loss=0.3), runs=2)
-    counts = counted(lossy, np.ones(lossy.gnss.shape[:3], dtype=bool))
+    counts = counted(lossy, np.ones(lossy.gnss.shape[:3], bool))
     pairs = {pair: k for k, pair in enumerate(zip(*(getattr(lossy.links, s) for s in SIDES), strict=True))}
     back = [pairs[t, j, i] for t, i, j in pairs]
     assert np.array_equal(counts, (lossy.arrival >= 0) | (lossy.arrival[:, back] >= 0))
     assert counts.mean() == pytest.approx(0.91, abs=0.02)
     one_way = observe(standing([[0, 0, 0], [9, 0, 0], [20, 0, 0]]), S2, V2X(max_neighbours=1))
-    assert counted(one_way, np.ones(one_way.gnss.shape[:3], dtype=bool)).all()
-    assert not counted(one_way, np.zeros(one_way.gnss.shape[:3], dtype=bool)).any()
+    assert counted(one_way, np.ones(one_way.gnss.shape[:3], bool)).all()
+    assert not counted(one_way, np.zeros(one_way.gnss.shape[:3], bool)).any()

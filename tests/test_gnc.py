@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from conftest import refused
+from numpy.random import default_rng
 from random_graphs import PAIR, torn
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
@@ -41,7 +42,7 @@ def test_of_all_subsets_it_finds_the_best():
     """Truncated least squares of one point is a choice among 2^9 subsets; each is a weighted mean."""
     found = 0
     for seed in range(20):
-        rng = np.random.default_rng(seed)
+        rng = default_rng(seed)
         z = rng.normal(size=(9, 3))
         z[: seed % 5] += rng.uniform(-40, 40, (seed % 5, 3))
         problem = Problem(("a",)).add("position", ["a"], [[0, 0, 0]], std=3.0).add("position", ["a"] * 9, z, std=1.0)
@@ -71,7 +72,7 @@ def test_a_group_is_one_hypothesis():
 
 def test_wrong_loop_closures_are_those_that_gtsam_finds():
     """Poses in the plane, against BetweenFactorPose2 under GncLMOptimizer."""
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     turn, std = [0, 0, 0, np.pi / 2] * 5, np.array([0.1, 0.1, 0.02])
     steps = (gtsam.Pose2(2.0, 0, angle) for angle in turn)
     poses = [*itertools.accumulate(steps, gtsam.Pose2.compose, initial=gtsam.Pose2())]

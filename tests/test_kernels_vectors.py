@@ -4,7 +4,8 @@ import os
 
 import numpy as np
 import pytest
-from numpy.linalg import inv, solve
+from numpy.linalg import inv, qr, solve
+from numpy.random import default_rng
 from shell import python
 
 from coopoc.arrays import Floats
@@ -35,9 +36,9 @@ def inverted(a: Floats):
 
 def test_a_covariance_with_an_unknown_angle_keeps_its_digits():
     """In closed form: variances along three axes; the adjugate had lost the determinant."""
-    rng, variances = np.random.default_rng(5), np.array([0.4, 0.1, 8.6e8])
+    rng, variances = default_rng(5), np.array([0.4, 0.1, 8.6e8])
     for _ in range(50):
-        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        axes = qr(rng.normal(size=(3, 3)))[0]
         a = (axes * variances @ axes.T).ravel()
         inverted(a)
         assert a == pytest.approx((axes / variances @ axes.T).ravel(), abs=1e-5)
@@ -49,7 +50,7 @@ def blockwise(matrix: Floats, d: int) -> Floats:
 
 @pytest.mark.parametrize("batched", [False, True])
 def test_blocks_against_numpy(batched):
-    d, size, rng = 3, 3 * BLOCKS, np.random.default_rng(3)
+    d, size, rng = 3, 3 * BLOCKS, default_rng(3)
     root = rng.normal(size=(size, size))
     a, eta, process = root @ root.T + np.eye(size), rng.normal(size=size), rng.uniform(0.1, 1.0, size)
     shape = (lambda v: np.repeat(v[:, None], LANES, axis=1)) if batched else np.copy

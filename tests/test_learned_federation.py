@@ -1,9 +1,9 @@
 """Federation: laws on gains that are no net; rules against Flower's own, SciPy and closed forms; Byzantine clients."""
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -376,11 +376,11 @@ def test_weights_that_are_not_finite_are_never_taken():
 def federation(losses: np.ndarray) -> Federation:  # type: ignore[type-arg]
     """A history with these losses (rounds, C)."""
     names = tuple(f"c{i}" for i in range(losses.shape[1]))
-    rows = [Round(k, torch.zeros(1), (math.nan,) * len(row), tuple(row)) for k, row in enumerate(losses.tolist())]
+    rows = [Round(k, torch.zeros(1), (nan,) * len(row), tuple(row)) for k, row in enumerate(losses.tolist())]
     return Federation(GainNet(2, 1), tuple(rows), (5,) * len(names), 0.0, names)
 
 
-@pytest.mark.parametrize("false", [math.nan, math.inf, 1e308, 1e5, 0.0])
+@pytest.mark.parametrize("false", [nan, inf, 1e308, 1e5, 0.0])
 @pytest.mark.parametrize("clients", [3, 4, 12])
 def test_one_client_cannot_select_the_untrained_round(false, clients):
     """It praises the start and condemns every other round; the others' losses fall from 4 to 1 m^2."""

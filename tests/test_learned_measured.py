@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from conftest import refused, slow_fixes, without
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
@@ -26,7 +27,7 @@ NETS = (GainNet(2, 1), NoiseParameters())
 
 def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> tuple[Recording, Fleet]:
     """Vehicles that stand by their odometry and move by N(0, 0.2^2) m a step: the noise of both is known exactly."""
-    rng, t = np.random.default_rng(seed), np.arange(steps) / 10
+    rng, t = default_rng(seed), np.arange(steps) / 10
     position = np.cumsum(rng.normal(0, 0.2, (steps, vehicles, 3)), axis=0)
     fleet = Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, np.full((steps, vehicles, 3), 1e-9))
     recording = observe(fleet, Sensors(gnss_std=(1.5, 1.5, 1.5)), V2X(max_neighbours=0))
@@ -124,7 +125,7 @@ def test_what_cannot_be_learned_from_is_refused():
 def log(tmp_path_factory):
     """Two vehicles and a road-side unit for 80 s: odometry at 10 Hz, fixes at 2 Hz that are off by 4 m to the east of
     one vehicle, and the truth of both."""
-    rng, rows, truth = np.random.default_rng(0), list[Any](), list[Any]()
+    rng, rows, truth = default_rng(0), list[Any](), list[Any]()
     for k, name in enumerate(("a", "b")):
         x = np.array([0.0, 9.0 * k])
         for step in range(800):

@@ -20,7 +20,7 @@ def track() -> co.Track:
         t=np.arange(4) * 0.1,
         egos=(2, 0),
         x=rng.normal(size=(*shape, 3)),
-        covariance=root @ root.swapaxes(-1, -2),
+        covariance=root @ root.mT,
         received_bytes=none,
         sent_bytes=none,
         seconds=0.0,

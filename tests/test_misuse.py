@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from numpy import nan
 from random_graphs import AB, PAIR
 
 import coopoc as co
@@ -45,7 +46,7 @@ WRONG: tuple[Any, ...] = (
     object(),
     b"x",
     np.ones((2, 2)),
-    np.full(3, np.nan),
+    np.full(3, nan),
 )
 """Values of the wrong kind, size or range; some are right for some fields."""
 RAGGED: tuple[Any, ...] = ([[1], [2, 3]], np.datetime64("2024-01-01"), np.array([1, 2], object), 1 + 2j, [10**400] * 4)
@@ -105,16 +106,13 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
     ("call", "words"),
     [
         (lambda: co.nees(BARE, FLEET), "this method claims none"),
-        (lambda: replace(TRACK, x=np.nan * TRACK.x), "not finite in run 0 at step 0"),
-        (lambda: co.Kalman()(replace(RECORDING, gnss=np.nan * RECORDING.gnss), [0]), "has no fix at step 0"),
+        (lambda: replace(TRACK, x=nan * TRACK.x), "not finite in run 0 at step 0"),
+        (lambda: co.Kalman()(replace(RECORDING, gnss=nan * RECORDING.gnss), [0]), "has no fix at step 0"),
         (lambda: load_graph("."), r"path = \.: must end in"),
         (lambda: followed("kalman", RECORDING, [0]), "method = 'kalman': must be a Method"),
         (lambda: replace(TRACK, egos=(-1, -2)), r"egos\[0\] = -1: must be >= 0"),
         (lambda: replace(TRACK, egos=(0, 9)), "egos = 9: must be an index in 0..3"),
-        (
-            lambda: replace(TRACK, t=np.where(TRACK.t > 0.3, np.nan, TRACK.t)),
-            r"t\[4\] = nan: must be finite and increase",
-        ),
+        (lambda: replace(TRACK, t=np.where(TRACK.t > 0.3, nan, TRACK.t)), r"t\[4\] = nan: must be finite and increase"),
         (lambda: replace(TRACK, t=TRACK.t[::-1]), r"t\[1\] = 0.4: must be finite and increase"),
         (lambda: co.NoiseModel("m"), "process_std = None: must be given"),
         (lambda: co.NoiseModel("m", SENSORS, gnss_std=(0, 1, 1)), r"gnss_std\[0\] = 0.0: must be positive"),
@@ -307,7 +305,7 @@ ANGLES = (*ANGULAR, "heading", "yaw_rate", "relative", "begin", "turn", "compass
 
 def first(value: Any, wrong: float) -> Any:
     """The numbers with one wrong one, or the number itself."""
-    array = np.array(value, dtype=float)
+    array = np.array(value, float)
     array.flat[0] = wrong
     return array if array.ndim else wrong
 
@@ -319,7 +317,7 @@ def others(value: Any) -> Any:
 
 
 CHANGES: dict[str, Callable[[Any], Any]] = {
-    **{str(wrong): partial(first, wrong=wrong) for wrong in (np.nan, np.inf, -1.0, 1e200, 1e-200)},
+    **{str(wrong): partial(first, wrong=wrong) for wrong in (nan, np.inf, -1.0, 1e200, 1e-200)},
     "shape": lambda value: np.array(value)[None, None],
     "dtype": lambda value: np.array(value).astype(str),
     "ids": others,
@@ -329,7 +327,7 @@ CHANGES: dict[str, Callable[[Any], Any]] = {
 
 def arrays(found: Any) -> list[Any]:
     if isinstance(found, np.ndarray | float | np.floating):
-        return [np.asarray(found, dtype=float)]
+        return [np.asarray(found, float)]
     parts = found if isinstance(found, list | tuple) else vars(found).values() if hasattr(found, "__dict__") else ()
     return [array for part in parts for array in arrays(part)]
 

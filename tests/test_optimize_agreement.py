@@ -42,7 +42,7 @@ def linear() -> Problem:
     names = [f"v{k}" for k in range(8)]
     root = rng.normal(size=(7, 3, 3))
     problem = Problem(names).add("position", names, 5.0 * rng.normal(size=(8, 3)), std=[3.0, 3.0, 5.0])
-    cov = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(3)
+    cov = root @ root.mT + 0.1 * np.eye(3)
     return problem.add("displacement", list(itertools.pairwise(names)), rng.normal(size=(7, 3)), cov=cov)
 
 

@@ -199,7 +199,7 @@ def test_surface_lane_and_top_speed_are_scipys(seed):
     gone = solution.x[2:] - solution.x[:-2]
     assert norm(gone, axis=1).max() == pytest.approx(7.0, abs=1e-6)  # the limit is met, not passed
     assert solution.x[:, 2] == pytest.approx(road(solution.x[:, 0], solution.x[:, 1]), abs=1e-9)
-    assert np.abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
+    assert abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
 
 
 def test_the_covariance_holds_equalities_exactly():
@@ -234,7 +234,7 @@ def test_multipliers_are_those_of_ipopt():
         x0=solution.x.ravel(), lbg=[0.0] * n + [-0.8] * n + [-INF] * m, ubg=[0.0] * n + [0.8] * n + [14.0] * m
     )
     assert held.multipliers == pytest.approx(np.asarray(found["lam_g"]).ravel(), abs=1e-6)
-    assert np.abs(held.multipliers[n:]).max() > 0.01
+    assert abs(held.multipliers[n:]).max() > 0.01
 
 
 def test_poses_in_a_slab():
@@ -260,7 +260,7 @@ def test_poses_in_a_slab():
     y = np.c_[0 * turn, first.x[:, 1], 0 * turn]
     bounds = (np.minimum(-room - y, -1e-12).ravel(), np.maximum(room - y, 1e-12).ravel())
     assert lsq_linear(J.toarray(), -r, bounds, method="bvls", tol=1e-15).x == pytest.approx(0.0, abs=1e-6)
-    assert np.abs(first.position[:, 1]).max() == pytest.approx(0.5, abs=1e-9)
+    assert abs(first.position[:, 1]).max() == pytest.approx(0.5, abs=1e-9)
 
 
 def east(problem: Problem, node: str, lower: float = -INF, upper: float = INF) -> Problem:
@@ -365,7 +365,7 @@ def test_osqp_holds_answers_against_all_kkt_conditions():
 def test_a_claim_is_verified_independently_of_the_solver(claim, status):
     claims = Backend(
         "claims",
-        lambda problem, x: SolverResult(np.array(claim, dtype=float), 1),
+        lambda problem, x: SolverResult(np.array(claim, float), 1),
         capabilities=Capabilities(constraints="linear"),
     )
     problem = PAIR.constrain("position", "a", upper=[5, INF, INF])

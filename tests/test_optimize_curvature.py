@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.linalg import eigvalsh
 from oracles.whitened import hessian
 
 from coopoc.optimize import Problem, SolveError, Status, backends, solve
@@ -27,7 +28,7 @@ def test_the_sign_of_the_curvature_is_that_of_casadis_hessian():
     signs = []
     for seed in range(40):
         problem = tangle(seed)
-        lowest = np.linalg.eigvalsh(hessian(problem, problem.x0)).min()
+        lowest = eigvalsh(hessian(problem, problem.x0)).min()
         assert abs(lowest) > 1e-4
         assert (newton_decrease(problem, problem.x0) is not None) == (lowest > 0)
         signs.append(lowest > 0)
@@ -45,7 +46,7 @@ def test_a_saddle_is_not_solved(backend):
     problem = replace(problem, x0=problem.factors[0].z)
     stuck = solve(problem, backend, throw=False)
     assert stuck.status is Status.SADDLE
-    assert np.linalg.eigvalsh(hessian(problem, stuck.x)).min() < -0.1
+    assert eigvalsh(hessian(problem, stuck.x)).min() < -0.1
     with pytest.raises(SolveError, match="to the side"):
         solve(problem, backend)
     assert freely.cost < stuck.cost / 100

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 
 import coopoc as co
 from coopoc import workers
@@ -35,7 +36,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
     rng, names = np.random.default_rng(seed), list("abcde")
     pairs = [(i, j) for i in range(5) for j in range(i)]
     truth, start = rng.normal(0, 10, (2, 5, 3))
-    distance = np.linalg.norm([truth[i] - truth[j] for i, j in pairs], axis=1) + rng.normal(0, 0.5, (3, 10))
+    distance = norm([truth[i] - truth[j] for i, j in pairs], axis=1) + rng.normal(0, 0.5, (3, 10))
 
     def solved(unit):
         problem = Problem(names, x0=start, search=Search(x0=start)).add("position", names, truth, std=2.0 * unit)
@@ -54,7 +55,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
 def ranged() -> Problem:
     x0 = np.array([[0.0, 0], [9, 0], [0, 9], [5, 5]])
     problem = Problem("abcx", x0=x0, dimension=2).add("position", list("abc"), x0[:3], 1e-3)
-    return problem.add("range", [("x", name) for name in "abc"], np.linalg.norm(x0[:3] - [3.0, 4.0], axis=1), 0.1)
+    return problem.add("range", [("x", name) for name in "abc"], norm(x0[:3] - [3.0, 4.0], axis=1), 0.1)
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "osqp"])

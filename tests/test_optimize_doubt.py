@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import refused
+from numpy import inf
+from numpy.linalg import eigh, inv, norm
 from random_graphs import PAIR, random_drive, torn
 from scipy.stats import chi2
 
@@ -22,7 +24,7 @@ def ranged(seed: int) -> Problem:
     """Eight points in space from random starts: three have a fix, and all ranges between them are measured."""
     rng, pairs = np.random.default_rng(seed), np.column_stack(np.triu_indices(8, 1))
     truth, x0 = rng.uniform(-20, 20, (2, 8, 3))
-    z = np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)) + rng.normal(0, 0.1, 28)
+    z = norm(np.diff(truth[pairs], axis=1), axis=(1, 2)) + rng.normal(0, 0.1, 28)
     fixes = truth[:3] + rng.normal(0, 0.3, (3, 3))
     alone = Search("random", x0=x0)
     problem = Problem([f"v{k}" for k in range(8)], x0=x0, search=alone).add("position", range(3), fixes, std=0.3)
@@ -43,11 +45,9 @@ def test_a_cost_that_the_noise_does_not_explain_is_noted():
     assert 0 < sum(noted) < len(noted)
 
 
-@pytest.mark.parametrize(
-    "noise", [{"std": [np.inf, np.inf, 0.1]}, {"sqrt_information": 10 * np.eye(3)[[2, 2, 2]] / 3**0.5}]
-)
+@pytest.mark.parametrize("noise", [{"std": [inf, inf, 0.1]}, {"sqrt_information": 10 * np.eye(3)[[2, 2, 2]] / 3**0.5}])
 def test_what_is_not_measured_is_no_number(noise):
-    heights = Problem("a").add("position", "a", [0, 0, 0], std=[1.0, 1.0, np.inf])
+    heights = Problem("a").add("position", "a", [0, 0, 0], std=[1.0, 1.0, inf])
     heights = heights.add("position", ["a"] * 100, np.zeros((100, 3)), **noise)
     assert solve(heights).expected == pytest.approx(99 / 2)
 
@@ -64,9 +64,9 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
     )
     with refused(r"line 5 = information.*positive definite.*--repair"):
         load_graph(file)
-    own, axes = np.linalg.eigh([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
+    own, axes = eigh([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
     nearest = axes * np.maximum(own, 0.0) @ axes.T
-    read = np.linalg.inv(load_graph(file, repair=True).relative_pose.covariance[1])
+    read = inv(load_graph(file, repair=True).relative_pose.covariance[1])
     assert read == pytest.approx(nearest, abs=1e-4)
     with pytest.raises(SystemExit):
         main(["solve", str(file), "--repair"])

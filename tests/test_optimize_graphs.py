@@ -51,7 +51,7 @@ def test_what_is_solved_is_scipys_minimum(seed):
     theirs = scipys(problem, found.x, xtol=1e-14, ftol=1e-15)
     assert found.status is Status.SOLVED
     assert theirs.cost == pytest.approx(found.cost, rel=1e-9)
-    assert np.abs(theirs.x).max() < 1e-5
+    assert abs(theirs.x).max() < 1e-5
 
 
 @DIMENSIONS
@@ -102,9 +102,9 @@ def test_tapes_are_the_formulas(dimension, objective, loss):
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     assert cost == pytest.approx(problem.cost(x), rel=1e-12)
     assert system.cost(x) == pytest.approx(cost, rel=1e-12)
-    assert gradient == pytest.approx(J.T @ r, abs=1e-9 * np.abs(J.T @ r).max())
+    assert gradient == pytest.approx(J.T @ r, abs=1e-9 * abs(J.T @ r).max())
     dense = (J.T @ J).toarray()
-    assert upper(system, values) == pytest.approx(np.triu(dense), abs=1e-9 * np.abs(dense).max())
+    assert upper(system, values) == pytest.approx(np.triu(dense), abs=1e-9 * abs(dense).max())
     values = system.quadratic(x, "newton")[2]
     if loss != "truncated":  # its differences jump at the kink
         exact, h = np.empty_like(dense), 1e-6
@@ -113,7 +113,7 @@ def test_tapes_are_the_formulas(dimension, objective, loss):
             up, down = ((J.T @ r)[movable] for r, J in map(problem.whiten, ends))
             exact[k] = (up - down) / (2.0 * h)
         exact = 0.5 * (exact + exact.T)
-        assert upper(system, values) == pytest.approx(np.triu(exact), abs=3e-6 * np.abs(exact).max())
+        assert upper(system, values) == pytest.approx(np.triu(exact), abs=3e-6 * abs(exact).max())
 
 
 def upper(system: Sparse, values: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ def assert_same_objective(problem: Problem):
     gradient, theirs = (jacobian.T @ residual).reshape(5, -1), graph.linearize(at).gradientAtZero()
     for i, turn in enumerate(tangent(problem.space, posed, x)):
         found = theirs.at(i) if theirs.exists(i) else np.zeros(turn.shape[1])
-        assert found == pytest.approx(turn.T @ gradient[i], rel=1e-9, abs=1e-9 * np.abs(gradient).max())
+        assert found == pytest.approx(turn.T @ gradient[i], rel=1e-9, abs=1e-9 * abs(gradient).max())
 
 
 @pytest.mark.parametrize(

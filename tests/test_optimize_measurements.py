@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import DIMENSIONS, refused
+from numpy.random import default_rng
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
@@ -13,7 +14,7 @@ from coopoc.optimize import MEASUREMENTS, Problem, measurement
 from coopoc.optimize.model.measurements import Measurement
 from coopoc.optimize.model.space import Space, exp, pose
 
-VECTORS = np.random.default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
+VECTORS = default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
 
 
 ROTATIONS = Rotation.random(50, random_state=1).as_matrix()
@@ -27,7 +28,7 @@ def test_derivatives_equal_torchs(kind, dimension):
     known, space, d = MEASUREMENTS[kind], Space(dimension, has_rotation=True), dimension
     if d == 2 and known.plane is None:
         pytest.skip(f"{kind} does not exist in the plane")
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     x = pose(rng.normal(size=(3, COUNT, d)) * 15.0, rng.normal(size=(3, COUNT) if d == 2 else (3, COUNT, 3)))
     if kind.startswith("relative_pose"):
         near = space.rotation(x[0, 4:]) @ exp(

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused
+from numpy import inf, nan
 from numpy.linalg import cholesky, eigvalsh, inv, lstsq
 from numpy.random import default_rng
 from oracles.whitened import whitened
@@ -87,14 +88,14 @@ def test_a_range_below_the_gate_widens_its_angles(recording):
 
 
 def test_infinite_std_is_no_measurement():
-    with_blank = PAIR.add("spherical", AB, [9.5, 0.1, 1.5], std=np.inf).add("range", AB, 10, std=1.0)
+    with_blank = PAIR.add("spherical", AB, [9.5, 0.1, 1.5], std=inf).add("range", AB, 10, std=1.0)
     without = PAIR.add("range", AB, 10, std=1.0)
     for backend in ("gauss-newton", "gtsam", "osqp"):
         assert solve(with_blank, backend).x == pytest.approx(solve(without).x, abs=1e-9)
 
 
 BAD = {
-    "nan": (lambda: PAIR.add("position", "a", [0, np.nan, 0], std=1.0), "finite"),
+    "nan": (lambda: PAIR.add("position", "a", [0, nan, 0], std=1.0), "finite"),
     "zero std": (lambda: PAIR.add("range", AB, 5.0, std=0.0), "must be > 0"),
     "degrees": (lambda: PAIR.add("azimuth", AB, 270.0, std=0.1), "deg2rad"),
     "zero range": (lambda: PAIR.add("range", AB, 0.0, std=1.0), "Coincident"),
@@ -108,7 +109,7 @@ BAD = {
     "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.ones((2, 3))), "square matrices"),
     "std of a turn": (lambda: PAIR.add("azimuth", AB, 0.1, std=4.0), "<= pi rad"),
     "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
-    "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[np.inf]]), "must be finite"),
+    "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[inf]]), "must be finite"),
     "heights in a plane": (
         lambda: Problem("ab", dimension=2).constrain("inclination", AB, 0.0, 1.0),
         "does not exist in two dimensions",
@@ -129,7 +130,7 @@ BAD = {
     "words for z": (lambda: PAIR.add("range", AB, "far", std=1.0), "array of numbers"),
     "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
     "shown": (lambda: Problem(AB, shown="c"), "node = .c.: must be one of a, b"),
-    "x0 not finite": (lambda: Problem(("a",), x0=[[np.nan, 0, 0]]), "x0 = not finite"),
+    "x0 not finite": (lambda: Problem(("a",), x0=[[nan, 0, 0]]), "x0 = not finite"),
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
@@ -226,10 +227,10 @@ def incomplete():
     seen = observe(fleet, Sensors.paper_scenario2(), V2X(6), runs=4, observers=[5])
     rng = default_rng(0)
     gnss, relative = seen.gnss.copy(), seen.relative.copy()
-    gnss[rng.random(gnss.shape[:3]) < 0.5] = np.nan
+    gnss[rng.random(gnss.shape[:3]) < 0.5] = nan
     for part, share in ((slice(None), 0.1), (1, 0.1), (slice(1, 3), 0.1), (0, 0.05)):
         lost = rng.random(relative.shape[:2]) < share
-        relative[..., part][lost] = np.nan
+        relative[..., part][lost] = nan
     return replace(seen, gnss=gnss, relative=relative)
 
 

@@ -12,7 +12,7 @@ import pytest
 import range_only
 import tightness
 from conftest import measured, refused
-from numpy.linalg import eigvalsh, lstsq
+from numpy.linalg import det, eigvalsh, lstsq, qr
 from numpy.random import default_rng
 from random_graphs import scipys
 from scipy.io import mmread
@@ -159,8 +159,8 @@ def test_no_point_beats_the_bounds(make, seed):
     best = relaxation.lower_bound
     rng, space = default_rng(seed), problem.space
     for _ in range(50):
-        turned = np.linalg.qr(rng.standard_normal((len(problem.names), problem.dimension, problem.dimension)))[0]
-        turned[:, :, 0] *= np.sign(np.linalg.det(turned))[:, None]
+        turned = qr(rng.standard_normal((len(problem.names), problem.dimension, problem.dimension)))[0]
+        turned[:, :, 0] *= np.sign(det(turned))[:, None]
         if problem.x0 is not None and problem.fixed:
             turned[0] = space.rotation(problem.x0)[0]
         point = space.join(rng.normal(0, 10, (len(problem.names), problem.dimension)), turned)
@@ -195,15 +195,15 @@ def test_the_elimination_is_numpys(make, monkeypatch):
     rest = A @ np.concatenate([np.eye(form.bound), -lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]])
     C = rest.T @ rest
     X = form.project(default_rng(0).standard_normal((form.bound, form.columns)))
-    assert small.matrix == pytest.approx(C, abs=1e-9 * np.abs(C).max())
-    assert small.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
+    assert small.matrix == pytest.approx(C, abs=1e-9 * abs(C).max())
+    assert small.times(X) == pytest.approx(C @ X, abs=1e-9 * abs(C).max())
     assert np.square(A @ small.settle(X)).sum() == pytest.approx(np.sum(X * (C @ X)), rel=1e-9)
     L = multipliers(form, X, small.times(X))
     (a,) = small.smallest(L)
     assert a == pytest.approx(eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
     monkeypatch.setattr(relaxation, "FORMED_ROWS", 0)
     large = Reduced(form)
-    assert large.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
+    assert large.times(X) == pytest.approx(C @ X, abs=1e-9 * abs(C).max())
     (b,) = large.smallest(L)
     assert a == pytest.approx(b, rel=1e-7)
 
@@ -277,14 +277,14 @@ def test_the_eigenvalue_is_that_of_the_whole_matrix():
             X = form.lift(solution.x, np.tile(np.eye(2), (6, 1, 1)))
             Q = (form.rows.T @ form.rows).toarray()
             CX = (Q @ X)[: form.bound]
-            assert np.abs((Q @ X)[form.bound :]).max() < 1e-4 * np.abs(Q).max()
+            assert abs((Q @ X)[form.bound :]).max() < 1e-4 * abs(Q).max()
             S = Q.copy()
             for block in form.stiefel:
                 S[np.ix_(block, block)] -= 0.5 * (CX[block] @ X[block].T + X[block] @ CX[block].T)
             for (row,) in form.sphere:
                 S[row, row] -= CX[row] @ X[row]
             smallest = certify(problem, solution).smallest_eigenvalue
-            tolerance = 1e-9 * np.abs(Q).max()
+            tolerance = 1e-9 * abs(Q).max()
             assert (eigvalsh(S)[0] < -tolerance) == (smallest < -tolerance)
 
 

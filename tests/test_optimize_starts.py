@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import DESCENTS
+from numpy import pi
 from numpy.linalg import norm
 from numpy.random import default_rng
 from random_graphs import random_drive, scipys
@@ -19,7 +20,7 @@ from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.factor import taken
 from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import Space, exp
-from coopoc.optimize.starts import graph_starts, race
+from coopoc.optimize.starts import graph_starts, mirrors, race
 from coopoc.optimize.starts.graph_starts import tree, walk
 from coopoc.optimize.starts.mirrors import ranges_of, rewound
 
@@ -28,7 +29,7 @@ def flat_drive(seed: int) -> Problem:
     """A drive within 0.3 m of a plane, with three landmarks that are ranged."""
     w = world(seed, 3, 1, 60, 3, size=20.0)
     low = w.position.copy()
-    low[:60, 2] *= 0.3 / np.abs(low[:60, 2]).max()
+    low[:60, 2] *= 0.3 / abs(low[:60, 2]).max()
     w = replace(w, position=low)
     return from_graph(w.graph(relative_pose=w.relative(w.chain(), 0.05, 0.02), ranges=w.ranged(w.to_points(40), 0.3)))
 
@@ -41,7 +42,7 @@ def test_landmarks_beside_a_plane_are_mirrored(seed):
     found, costs = solve(problem), list[float]()
     for sides in np.ndindex(2, 2, 2):
         x = found.x.copy()
-        x[60:, 2] = np.abs(x[60:, 2]) * (2 * np.array(sides) - 1)
+        x[60:, 2] = abs(x[60:, 2]) * (2 * np.array(sides) - 1)
         end = solve(replace(problem, x0=x, search=Search()), throw=False)
         assert "minimum" in str(end.notes) or end.cost <= found.cost * (1 + 1e-4)
         costs.append(end.cost)
@@ -114,7 +115,7 @@ def test_exact_ranges_end_at_the_truth_without_a_word():
     problem = problem.add("range", pairs, z, std=0.1)
     found = solve(problem)
     assert ranges_of(problem, truth).cost(z[:, None], np.arange(28)) == 0.0
-    assert np.abs(found.x - truth).max() < 1e-6
+    assert abs(found.x - truth).max() < 1e-6
     assert not found.notes
 
 
@@ -194,7 +195,7 @@ def test_a_walk_counts_beyond_what_32_bits_hold():
 
 def ring(n: int, wrong: float) -> Graph:
     """A drive round a circle whose turns are `wrong` by this in all, and its closure."""
-    edge, turn = np.c_[np.arange(n), np.roll(np.arange(n), -1)], (2 * np.pi + wrong) / n
+    edge, turn = np.c_[np.arange(n), np.roll(np.arange(n), -1)], (2 * pi + wrong) / n
     moved = PoseEdges(edge, np.tile([1.0, 0], (n, 1)), np.full((n, 1), turn), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     names = tuple(f"A{k}" for k in range(n))
     nan = np.full((n, 2), np.nan)
@@ -205,23 +206,43 @@ def test_the_tree_shares_what_a_loop_does_not_close():
     """Of a ring with equal variances every turn takes the same part; against that closed form."""
     graph = ring(8, 0.4)
     turn = Space(2, has_rotation=True).rotation(tree(graph))
-    moved = np.swapaxes(turn, 1, 2) @ np.roll(turn, -1, axis=0)
-    assert np.arctan2(moved[:, 1, 0], moved[:, 0, 0]) == pytest.approx(2 * np.pi / 8, abs=1e-9)
+    moved = turn.mT @ np.roll(turn, -1, axis=0)
+    assert np.arctan2(moved[:, 1, 0], moved[:, 0, 0]) == pytest.approx(2 * pi / 8, abs=1e-9)
 
 
 def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
     """Errors of a ring that sum to 1.5 rad, of two thousand that sum to thousands, or to a whole turn."""
     problem, space = from_graph(ring(2000, 0.0), start="odometry"), Space(2, has_rotation=True)
-    course = 2 * np.pi * np.arange(2000) / 2000
+    course = 2 * pi * np.arange(2000) / 2000
     shaken = course + 0.5 * default_rng(0).choice([-1.0, 1.0], 2000)
     for turns, expected in (
         (course, True),
-        (course + 1.5 * course / (2 * np.pi), True),
+        (course + 1.5 * course / (2 * pi), True),
         (shaken, True),
         (0 * course, False),
     ):
         wound = rewound(problem, space.join(np.zeros((2000, 2)), exp(turns[:, None])), 0.0)
         assert (next(wound, None) is None) is expected
+
+
+@pytest.mark.parametrize(("d", "seed"), [(2, 1), (3, 2)])
+def test_no_turn_is_averaged_that_a_bound_excludes(d, seed, monkeypatch):
+    """Cycles whose deviations together are small; averages agree that none is wound as cheaply."""
+    problem = from_graph(random_drive(seed, d), start="file")
+    with monkeypatch.context() as without:
+        without.setattr(mirrors, "averaging", None)
+        x = solve(replace(problem, search=Search())).x
+    monkeypatch.setattr(mirrors, "_windable", lambda *_: True)
+    assert not [*rewound(problem, x, 10.0)]
+
+
+def test_points_with_vague_fixes_are_mirrored_together():
+    """Closed form: fixes prefer the other side of the line through two towers by 10 / 81."""
+    pairs, x = np.array([(0, 2), (1, 2), (0, 3), (1, 3), (2, 3)]), np.array([[0, 0], [9, 0], [4, 3], [6, 2.0]])
+    apart = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
+    problem = Problem("abcd", x0=x, dimension=2, fixed="ab").add("position", [2, 3], [[4, -1], [6, -1]], std=9.0)
+    problem = problem.add("range", pairs, apart, std=0.01)
+    assert "minimum costs 0.123 less" in str(solve(problem).notes)
 
 
 @DESCENTS
@@ -241,7 +262,7 @@ def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     """Bad odometry and random ranges: most steps move what is new alone; against the descent from the truth."""
     drive, rng, sizes = world(0, 2, 1, 300), default_rng(1), list[int]()
     pairs = rng.integers(0, 300, (700, 2))
-    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 1][:600]
+    pairs = pairs[abs(pairs[:, 0] - pairs[:, 1]) > 1][:600]
     edges = drive.relative(drive.chain(), 0.1, 0.05)
     graph = drive.graph(relative_pose=edges, ranges=drive.ranged(pairs, 0.1))
 

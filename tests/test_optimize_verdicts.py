@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import DESCENTS
 from numpy.linalg import inv, norm
+from numpy.random import default_rng
 from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
@@ -37,7 +38,7 @@ def test_an_infinite_cost_is_no_minimum(z, std, backend):
 @pytest.mark.parametrize("seed", range(12))
 def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     """SciPy's curvature by differences of its own cost is the inverse of the covariance."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     angle = rng.uniform(0, np.pi)
     along = np.array([np.cos(angle), np.sin(angle)])
     anchors, truth = np.outer([0, 10, 25.0], along), along * rng.uniform(2, 20)
@@ -126,7 +127,7 @@ def test_a_certified_mirror_image_is_not_unique():
 @pytest.mark.parametrize("seed", range(8))
 def test_a_lower_bound_is_below_the_cost(seed):
     """Closed form: the least cost of a chain of fixes by elimination in exact fractions."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     z, u = 1e4 * rng.normal(size=6), rng.normal(size=5)
     s, t = 10.0 ** rng.uniform(-3, 0, 2)
     fix, chain = np.zeros((6, 3)), np.zeros((5, 3))

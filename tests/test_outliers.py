@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import among, refused
+from numpy import nan
 from numpy.linalg import norm
 
 from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors, observe
@@ -69,9 +70,9 @@ def test_outliers_are_added_to_the_clean_draws(crossing, frame):
     assert not np.isnan(bad.gnss[:, 0]).any()
     assert np.array_equal(bad.gnss[:, 0], clean.gnss[:, 0])
     everywhere = seen(crossing, Outliers(fixes=Fault(1.0, (10.0, 10.0))), frame=frame, runs=20).gnss - clean.gnss
-    assert np.abs(everywhere[:, 1:].mean(axis=(0, 1, 2))).max() < 0.3  # of 10 m in any direction
+    assert abs(everywhere[:, 1:].mean(axis=(0, 1, 2))).max() < 0.3  # of 10 m in any direction
     slip = bad.velocity - clean.velocity
-    assert abs((np.abs(slip).max(axis=-1) > 1e-9).mean() - 0.1) < 0.03
+    assert abs((abs(slip).max(axis=-1) > 1e-9).mean() - 0.1) < 0.03
     assert bad.sensors == clean.sensors
     assert [note.split()[0] for note in bad.notes] == ["5", "2", "10", "5", "10"]
 
@@ -80,9 +81,9 @@ def test_a_slip_is_a_share_of_the_true_motion(crossing):
     clean, bad = (seen(crossing, o, runs=20) for o in (Outliers(), ALL))
     speed = norm(crossing.velocity, axis=-1)
     share = np.einsum("rtni,tni->rtn", bad.velocity - clean.velocity, crossing.velocity) / speed**2
-    wrong = np.abs(share) > 1e-9
-    assert np.abs(share[wrong]).min() > 0.2 - 1e-6
-    assert np.abs(share[wrong]).max() < 1.0 + 1e-6
+    wrong = abs(share) > 1e-9
+    assert abs(share[wrong]).min() > 0.2 - 1e-6
+    assert abs(share[wrong]).max() < 1.0 + 1e-6
     assert 0.35 < (share[wrong] > 0).mean() < 0.65
     assert bad.velocity - clean.velocity == pytest.approx(share[..., None] * crossing.velocity, abs=1e-9)
 
@@ -93,7 +94,7 @@ def test_a_wrong_association_is_the_direction_of_the_nearest_other_vehicle(cross
     clean, bad = (
         observe(crossing, replace(exact, outliers=o), v2x, runs=4) for o in (Outliers(), Outliers(angles=Fault(0.1)))
     )
-    hit = np.abs(wrap(bad.relative[..., 1] - clean.relative[..., 1])) > 1e-6
+    hit = abs(wrap(bad.relative[..., 1] - clean.relative[..., 1])) > 1e-6
     assert 0.05 < hit.mean() < 0.12
     assert np.array_equal(bad.relative[..., 0], clean.relative[..., 0])
     direction = to_vector(bad.relative / [1, 1, 1]) / bad.relative[..., :1]
@@ -136,10 +137,10 @@ def test_what_is_told_is_what_differs_from_the_clean_recording(crossing, frame):
     clean, bad, told = (
         seen(crossing, o, frame=frame, remove_outliers=t) for o, t in ((Outliers(), 0 > 1), (ALL, 0 > 1), (ALL, True))
     )
-    by_hand = np.where(bad.relative == clean.relative, clean.relative, np.nan)
-    by_hand[..., 2] = np.where(np.isnan(by_hand[..., 1]), np.nan, by_hand[..., 2])
+    by_hand = np.where(bad.relative == clean.relative, clean.relative, nan)
+    by_hand[..., 2] = np.where(np.isnan(by_hand[..., 1]), nan, by_hand[..., 2])
     assert np.array_equal(told.relative, by_hand, equal_nan=True)
-    assert np.array_equal(told.gnss, np.where(bad.gnss == clean.gnss, clean.gnss, np.nan), equal_nan=True)
+    assert np.array_equal(told.gnss, np.where(bad.gnss == clean.gnss, clean.gnss, nan), equal_nan=True)
     assert np.array_equal(told.velocity, clean.velocity)
     assert all(note.endswith("removed") for note in told.notes)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import holed
+from numpy import nan
 from numpy.testing import assert_array_equal
 
 from coopoc import (
@@ -50,7 +51,7 @@ def test_missing_fixes_cost_and_do_not_crash(crossing, method):  # type: ignore[
 def test_a_drive_starts_with_a_fix(crossing):
     seen = observe(crossing, Sensors(), V2X(0))
     gnss = seen.gnss.copy()
-    gnss[:, 0] = np.nan
+    gnss[:, 0] = nan
     absent = Kalman()(replace(seen, gnss=gnss), [0]).absent
     assert absent is not None
     assert np.flatnonzero(absent).tolist() == [0]
@@ -72,7 +73,7 @@ def ranged() -> tuple[Fleet, Recording]:
     noise = Sensors(gnss_std=(2.0, 2.0, 0.01), velocity_std_ratio=0.02, velocity_floor=0.05, range_std=0.5)
     seen = observe(fleet, noise, V2X(max_neighbours=2, radius=200), runs=RUNS)
     relative, gnss = seen.relative.copy(), seen.gnss.copy()
-    relative[..., 1:], gnss[:, 0, 1:] = np.nan, np.nan
+    relative[..., 1:], gnss[:, 0, 1:] = nan, nan
     return fleet, replace(seen, relative=relative, gnss=gnss)
 
 

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from conftest import refused, with_masts
 from logs import noisy
+from numpy import inf, nan
 from numpy.linalg import inv, norm
 
 import coopoc as co
@@ -89,11 +90,11 @@ def test_scale_and_bias_are_found_where_they_act():
     for name, error in drawn.items():
         found, std = (track.extras[key][:, -1, 0] for key in (name, f"{name}_std"))
         assert std.max() < 0.05
-        assert np.abs((found - error[:, -1, 0]) / std).max() < 4.5
+        assert abs((found - error[:, -1, 0]) / std).max() < 4.5
     assert co.pose_nees(track, fleet).mean() == pytest.approx(3.0, abs=0.5)
     ignored = co.PoseFilter("solo", lasting=False)(seen, [0])
     assert co.pose_nees(ignored, fleet).mean() > 4.0
-    assert np.abs(co.heading_error(track, fleet)).mean() < np.abs(co.heading_error(ignored, fleet)).mean()
+    assert abs(co.heading_error(track, fleet)).mean() < abs(co.heading_error(ignored, fleet)).mean()
 
 
 def test_ranges_that_are_too_long_cost_little_where_that_is_a_state():
@@ -105,7 +106,7 @@ def test_ranges_that_are_too_long_cost_little_where_that_is_a_state():
     track, ideal = states(wrong, [0]), states(right, [0])
     found, std = (track.extras[name][:, -1, 0] for name in ("range_offset", "range_offset_std"))
     assert std.max() < 0.5
-    assert np.abs((found - drawn) / std).max() < 4.5
+    assert abs((found - drawn) / std).max() < 4.5
     error, least, without = (
         co.rt_le(t, fleet).mean() for t in (track, ideal, co.PoseFilter("fleet", lasting=False)(wrong, [0]))
     )
@@ -123,9 +124,9 @@ def test_the_gate_keeps_outliers_out():
     def error(recording, gate):
         return co.rt_le(co.PoseFilter("fleet", gate=gate)(recording, [1, 2]), fleet).mean()
 
-    clean = error(seen, np.inf)
+    clean = error(seen, inf)
     assert error(wrong, 5.0) < 1.1 * clean
-    assert error(wrong, np.inf) > 1.5 * clean
+    assert error(wrong, inf) > 1.5 * clean
     assert error(seen, 5.0) == pytest.approx(clean, rel=0.01)
 
 
@@ -161,7 +162,7 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
         columns = {"speed": (0.97 * 0.8 + 0 * t, 0.02), "yaw_rate": (turn - 0.01, 0.01)}
         for mark, gap in zip("uvw", anchors[:, None] - place, strict=True):
             longer = 0.2 + rng.exponential(3, len(t)) * (rng.random(len(t)) < wild)
-            columns[f"range_{mark}"] = np.abs(gap) + longer, 0.05
+            columns[f"range_{mark}"] = abs(gap) + longer, 0.05
             columns |= {f"bearing_{mark}": (np.angle(gap * np.exp(-1j * heading)), 0.05)} if bearings else {}
         tables.append(noisy(rng, t, name, columns))
         truths.append(
@@ -173,7 +174,7 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
     rec, own = log.recording, [log.recording.ids.index(name) for name in "abc"]
     begin = co.pose_start(rec)
     assert norm(begin[0, own, :2] - log.truth.position[0, own, :2], axis=1).max() < 1.0
-    assert np.abs(wrap(begin[0, own, 3] - log.truth.heading[0, own])).max() < 0.15
+    assert abs(wrap(begin[0, own, 3] - log.truth.heading[0, own])).max() < 0.15
     track = co.PoseFilter(begin=begin)(rec, own)
     assert co.rt_le(track, log.truth).max() < 0.1
     assert len(track.notes) == 1
@@ -187,11 +188,11 @@ def test_first_poses_come_from_ranges_alone():
     fleet = convoy(2, masts=5)
     fleet = replace(fleet, position=fleet.position + np.where(np.arange(7) % 2, 900.0, 920.0)[:, None])
     seen = observed(fleet, replace(WHITE, compass=False, gnss_std=(0.0,) * 3), runs=80, assumed=WHITE)
-    relative, fixes = np.where(np.arange(3) == 0, seen.relative, np.nan), np.array(seen.gnss)
-    fixes[:, :, :2] = np.nan
+    relative, fixes = np.where(np.arange(3) == 0, seen.relative, nan), np.array(seen.gnss)
+    fixes[:, :, :2] = nan
     off = co.pose_start(replace(seen, gnss=fixes, relative=relative))[:, :2] - np.c_[fleet.position[0, :2], [0.0, 0.19]]
     assert np.median(norm(off[..., :2], axis=-1)) < 1.2
-    assert np.abs(off[..., 3]).max() < 0.1
+    assert abs(off[..., 3]).max() < 0.1
 
 
 @pytest.mark.parametrize("seed", [6200024, 6200063])
@@ -211,10 +212,10 @@ def test_wheels_that_stand_lead_neither_their_robot_nor_its_fleet_away(seed):
 def test_after_a_gap_it_begins_anew():
     """Without a compass, to the west: at the pose that `pose_start` finds there, not at heading 0."""
     fleet, there = convoy(2, 200), np.full((200, 2, 3), [-1, -1, 1.0])
-    there[50:90, 1] = np.nan
+    there[50:90, 1] = nan
     fleet = replace(fleet, position=fleet.position * there, velocity=fleet.velocity * there)
     seen = observed(fleet, replace(WHITE, compass=False), runs=1)
     filter_ = co.PoseFilter(begin=co.pose_start(seen))
     error = filter_._begins(seen, [1])[:, 1, 1, 3] - np.arctan2(*fleet.velocity[90, 1, 1::-1])
-    assert np.abs(wrap(error)) < 0.3
+    assert abs(wrap(error)) < 0.3
     assert filter_(seen, [1]).absent.sum() == 40

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import refused
+from numpy.random import default_rng
 from test_report import Page
 
 from coopoc.cli import _status
@@ -226,14 +226,14 @@ def test_a_flipped_bit_is_noticed(tmp_path):
     """Of 4,000 flips without checksums 200 gave other numbers; now every one is noticed, that of the seal, too."""
 
     def noise(p):
-        draws = np.random.default_rng(0).normal(size=(40, 20))
+        draws = default_rng(0).normal(size=(40, 20))
         return [{"run": r, "ego": "a", "rt_le_m": float(d[0]), "quantiles": d.tolist()} for r, d in enumerate(draws)]
 
     run_study(Study("noise", "?", noise, {"x": (1,)}), tmp_path)
     (path,) = (tmp_path / "noise" / "cells").iterdir()
     content = path.read_bytes()
     seal = content.rindex(b"sha256:")
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     for at in [*rng.integers(0, len(content), 600).tolist(), *range(seal, seal + 71)]:
         damaged = bytearray(content)
         damaged[at] ^= 1 << int(rng.integers(8))

@@ -28,15 +28,15 @@ def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing, clean):
     few, many = (spoofed(clean, share, seed=2, honest=["c0"]) for share in (0.2, 0.5))
     offset = few.gnss - clean.gnss
     assert np.ptp(offset, axis=1).max() < 1e-9
-    moved, more = (np.abs(r.gnss - clean.gnss).max(axis=(1, 3)) > 1e-9 for r in (few, many))
+    moved, more = (abs(r.gnss - clean.gnss).max(axis=(1, 3)) > 1e-9 for r in (few, many))
     assert not moved[:, 0].any()
     assert (more >= moved).all()
     assert offset[:, 0][moved] == pytest.approx((many.gnss - clean.gnss)[:, 0][moved], abs=1e-9)
-    size = np.abs(offset[:, 0][moved])
+    size = abs(offset[:, 0][moved])
     assert size.min() > 5.0 - 1e-9
     assert size.max() < 40.0 + 1e-9
     signs = np.sign(many.gnss - clean.gnss)[:, 0]  # of liars and axes, independent: squares of sums are counts
-    assert (signs.sum(axis=(1, 2)) ** 2).sum() < 1.7 * np.abs(signs).sum()
+    assert (signs.sum(axis=(1, 2)) ** 2).sum() < 1.7 * abs(signs).sum()
     assert abs(moved[:, 1:].mean() - 0.2) < 3 * np.sqrt(0.2 * 0.8 / moved[:, 1:].size)
     assert abs(more[:, 1:].mean() - 0.5) < 3 * np.sqrt(0.5 * 0.5 / more[:, 1:].size)
     prefix = spoofed(observe(crossing, S2, V2X(max_neighbours=4), runs=3), 0.2, seed=2, honest=["c0"])
@@ -72,10 +72,10 @@ def test_an_attack_begins_creeps_and_colludes(crossing, clean):
     for step, t in enumerate(crossing.t - crossing.t[0]):
         assert late[:, step] == pytest.approx(full[:, step] * (t > 0.99), abs=1e-9)
         assert slow[:, step] == pytest.approx(full[:, step] * min(max(t - 1.0, 0.0) / 2.0, 1.0), abs=1e-9)
-    wrong = np.abs(alike[:, 0]).max(axis=-1) > 1e-9
-    assert np.array_equal(wrong, np.abs(full[:, 0]).max(axis=-1) > 1e-9)
+    wrong = abs(alike[:, 0]).max(axis=-1) > 1e-9
+    assert np.array_equal(wrong, abs(full[:, 0]).max(axis=-1) > 1e-9)
     for one, offsets in zip(wrong, alike[:, 0], strict=True):
-        assert np.abs(offsets[one] - offsets[one][:1]).max(initial=0.0) < 1e-9
+        assert abs(offsets[one] - offsets[one][:1]).max(initial=0.0) < 1e-9
 
 
 def test_an_estimator_that_is_told_of_an_attack_lacks_the_false_fixes(clean):

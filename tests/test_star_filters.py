@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import holed, slow_fixes, standing, textbook, without
 from filterpy.kalman import KalmanFilter
+from numpy import nan
 from numpy.linalg import eigvalsh, inv
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
@@ -53,8 +54,8 @@ def partial(recording: Recording) -> Recording:
     """Every third measurement a range only, others without inclination."""
     relative = recording.relative.copy()
     draw = np.random.default_rng(6).uniform(size=relative.shape[:2])
-    relative[draw < 0.3, 1:] = np.nan
-    relative[draw > 0.8, 2] = np.nan
+    relative[draw < 0.3, 1:] = nan
+    relative[draw > 0.8, 2] = nan
     return replace(recording, relative=relative)
 
 
@@ -117,10 +118,10 @@ def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: 
         each = [messages.members(star, run) for star in steps]
         x, cov, *others = oracle(method, recording, each)
         if sent:  # the positions in messages, brought forward
-            held = [[np.where(np.isfinite(m.variance), m.position, np.nan) for m in star[1:]] for star in each]
+            held = [[np.where(np.isfinite(m.variance), m.position, nan) for m in star[1:]] for star in each]
             others = [[np.reshape(star, (-1, 3)) for star in held]]
         assert_allclose(track.x[run, :, 0], x, atol=near)
-        assert_allclose(track.covariance[run, :, 0], cov, atol=near * np.abs(cov).max())
+        assert_allclose(track.covariance[run, :, 0], cov, atol=near * abs(cov).max())
         if others and len(track.neighbours[run]):
             assert_allclose(track.neighbours[run], np.concatenate(others[0]), atol=1e-5)
 
@@ -171,7 +172,7 @@ def test_a_state_without_process_noise_stays_finite(crossing):
     track = textbook(JointFilter(known))(recording, [1])
     mean = recording.gnss[:, :, 1].mean(axis=1)
     assert np.isfinite(track.x).all()
-    assert np.abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < np.abs(mean - still.position[-1, 1]).mean() + 0.5
+    assert abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < abs(mean - still.position[-1, 1]).mean() + 0.5
 
 
 @pytest.mark.parametrize("laplacian", [False, True])

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import holed, measured, refused, textbook
-from numpy.random import default_rng
+from numpy import nan
+from numpy.linalg import eigvalsh, inv, lstsq
+from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles.solo import filterpys
 from shell import ROOT, ran
@@ -116,7 +118,7 @@ def test_nothing_is_known_before_the_first_fix(name):
         assert_allclose(np.diag(cov), variance)
 
 
-def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float) -> tuple[float, float, float, float]:
+def window(draw: Generator, steps: int, late: int, q: float, r: float) -> tuple[float, float, float, float]:
     """Errors in m of a drive's end on one axis: the stream, the optimum, the stream without late fixes, and the
     optimum's own std. Odd steps bring the fix of `late` steps ago, even ones a prompt fix.
 
@@ -132,8 +134,8 @@ def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float)
         x, _ = full.step([fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1, fix_age=0.1 * (t - at[t]))
         without, _ = prompt.step(None if stale else [fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1)
     rows = np.vstack([np.eye(steps + 1)[at] / r, np.diff(np.eye(steps + 1), axis=0) / q])
-    best = np.linalg.lstsq(rows, np.concatenate([fixes / r, np.zeros(steps)]), rcond=None)[0][-1]
-    std = np.sqrt(np.linalg.inv(rows.T @ rows)[-1, -1])
+    best = lstsq(rows, np.concatenate([fixes / r, np.zeros(steps)]), rcond=None)[0][-1]
+    std = np.sqrt(inv(rows.T @ rows)[-1, -1])
     return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], std
 
 
@@ -151,11 +153,11 @@ def test_a_late_fix_is_nearly_used_up():
 @pytest.mark.parametrize(
     ("field", "given"),
     [
-        ("gnss", {"gnss": [1.0, np.nan, 2.0]}),
+        ("gnss", {"gnss": [1.0, nan, 2.0]}),
         ("velocity", {"velocity": [1.0, 2.0]}),
         ("velocity", {"velocity": [1e5, 0.0, 0.0]}),
         ("dt", {"dt": 0.0}),
-        ("fix_age", {"fix_age": np.nan}),
+        ("fix_age", {"fix_age": nan}),
         ("fix_age", {"fix_age": 0.7}),
     ],
 )
@@ -193,7 +195,7 @@ def test_bad_starts_are_named():
         "x0": lambda: Kalman("identity").start([0.0, 0.0]),
         "interval": lambda: Kalman("identity").start(interval=0.0),
         "history": lambda: Kalman("identity").start(history=-1.0),
-        "max_age": lambda: StarStream(CooperativeFilter(FITTED), max_age=np.nan),
+        "max_age": lambda: StarStream(CooperativeFilter(FITTED), max_age=nan),
         "noise_model": lambda: StarStream(CooperativeFilter("nominal")),
         "filter": lambda: StarStream(Kalman(FITTED)),  # type: ignore[arg-type]
         "message": lambda: RelativeMeasurement("b", [9.0, 0.0, 1.57], Z, U),
@@ -251,7 +253,7 @@ def test_a_range_of_zero_is_refused_and_forgotten(crossing):
     near = RelativeMeasurement("b", [1e-6, 0.1, 1.5], *other.broadcast)  # type: ignore[misc]
     x, cov = stream.step([0, 0, 0], [1, 0, 0], 0.1, neighbours=[near])
     assert np.isfinite(x).all()
-    assert (np.linalg.eigvalsh(cov) > 0).all()
+    assert (eigvalsh(cov) > 0).all()
     recording = observe(crossing, Sensors(), V2X(max_neighbours=2))
     relative = recording.relative.copy()
     relative[0, 3, 0] = 0.0

@@ -39,7 +39,7 @@ def results():
     for method, noise_model, level, bytes_each in lines:
         for k in (0, 2, 10):
             for run in range(5):
-                errors = np.abs(rng.normal(size=200)) * level
+                errors = abs(rng.normal(size=200)) * level
                 rows.append(
                     {
                         "method": method,
@@ -223,7 +223,7 @@ def test_no_figure_of_the_gallery_hides_a_line(file):
                 if first.get_color() != second.get_color():
                     a, b = (line.get_transform().transform(line.get_xydata()) for line in (first, second))
                     at = [x for x in (*a[:, 0], *b[:, 0]) if all(line[0, 0] <= x <= line[-1, 0] for line in (a, b))]
-                    gaps = np.abs(np.interp(at, *a.T) - np.interp(at, *b.T))
+                    gaps = abs(np.interp(at, *a.T) - np.interp(at, *b.T))
                     apart = max(gaps, default=np.inf) * 72 / panel.figure.dpi > first.get_linewidth() / 2
                     assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
     assert lines_seen or not find("coopoc.studies", file.stem).figures

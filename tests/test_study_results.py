@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from latex import compiled
+from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from test_report import Page
 
@@ -22,7 +23,7 @@ def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "noise_model
 
 @pytest.fixture
 def frame():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     rows = [
         {"method": m, "noise_model": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
         for m, kn in (("gnss", "identity"), ("kalman", "identity"), ("kalman", "fitted"), ("bound", "nominal"))
@@ -117,7 +118,7 @@ def test_tables_over_several_columns(frame):
 
 def test_what_noise_or_training_explains_is_not_the_best():
     """20 draws of a common noise: the joint filter is better by 0.1 m at k = 4; trainings differ by as much."""
-    draws = np.random.default_rng(0).normal(1.5, [[0.2], [0.01], [0.01]], (3, 20))
+    draws = default_rng(0).normal(1.5, [[0.2], [0.01], [0.01]], (3, 20))
     for other, seeds, bold in (("joint", (None,), [0, 2]), ("fedkalmannet", (0, 1, 2, 3, 4), [0, 0])):
         rows = [
             {"k": k, "method": method, "noise_model": "a", "train_seed": seed, "ego": "e", "run": run, "rt_le_m": value}

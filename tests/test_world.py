@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import among, refused, standing
+from numpy import nan, pi
+from numpy.random import Generator, Philox, SeedSequence, default_rng
 from scipy import stats
 from test_methods import SILENT
 
@@ -39,7 +41,7 @@ S2 = Sensors.paper_scenario2()
         ({"t": [0.0, 0.1, 0.201]}, "t"),
         ({"ids": ("a", "a")}, "ids"),
         ({"position": np.zeros((3, 1, 3))}, "position"),
-        ({"position": np.full((3, 2, 3), np.nan)}, "position/velocity"),
+        ({"position": np.full((3, 2, 3), nan)}, "position/velocity"),
         ({"position": np.full((3, 2, 3), np.inf)}, "position/velocity"),
     ],
 )
@@ -81,12 +83,12 @@ def test_float32_is_refused_and_unwrapped_headings_are_not():
     t = np.arange(300) / 10
     turn = np.c_[t, -t]
     circles = np.stack([9 * np.sin(turn), -9 * np.cos(turn), 0 * turn], axis=2)
-    fleet = Fleet(("a", "b"), t, circles, np.gradient(circles, 0.1, axis=0), heading=turn + np.array([0, np.pi]))
+    fleet = Fleet(("a", "b"), t, circles, np.gradient(circles, 0.1, axis=0), heading=turn + np.array([0, pi]))
     with refused(r"position.*float32, which are 0.5 m apart.*Subtract a local origin"):
         replace(fleet, position=(circles + np.array([5e5, 5.8e6, 0])).astype(np.float32))
     late = observe(fleet, S2, V2X(2), frame="body").between(200, 300)
     body = late.body
-    unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * np.pi))
+    unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * pi))
     assert not late.unlikely + unwrapped.unlikely
     stream = PoseFilter("solo", assumed=S2).start(0.1)
     for heading, fix in zip(t.tolist(), circles[:, 0], strict=True):
@@ -103,9 +105,9 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
     wrong = [
         (motions, replace(world, velocity=3.6 * world.velocity)),
         (motions, replace(world, velocity=world.velocity * [1, -1, 1])),
-        (motions, replace(body, body=Body(own.yaw_rate, np.pi / 2 - own.heading))),
+        (motions, replace(body, body=Body(own.yaw_rate, pi / 2 - own.heading))),
         (motions, replace(body, body=Body(np.clip(np.rad2deg(own.yaw_rate), -35, 35), own.heading))),
-        (motions, replace(body, velocity=3.6 * body.velocity, body=Body(own.yaw_rate, np.nan * own.heading))),
+        (motions, replace(body, velocity=3.6 * body.velocity, body=Body(own.yaw_rate, nan * own.heading))),
         ("azimuth_std is 2 rad, which is 115°", replace(world, sensors=replace(S2, azimuth_std=2.0))),
     ]
     for note, recording in wrong:
@@ -169,13 +171,13 @@ def test_velocity_readings():
 def test_vector_cov_against_sampling():
     """Independent check: the sample covariance of converted draws (small angles, so that first order holds)."""
     relative, std = np.array([25.0, 0.7, 1.3]), np.array([0.3, 0.01, 0.02])
-    draws = to_vector(relative + np.random.default_rng(1).standard_normal((200_000, 3)) * std)
+    draws = to_vector(relative + default_rng(1).standard_normal((200_000, 3)) * std)
     assert vector_cov(relative, std) == pytest.approx(np.cov(draws.T), abs=2e-3)
 
 
 def test_gilbert_elliott_share_and_burst():
     """Closed form: stationary loss and mean run length of the two-state chain."""
-    bad = lost(np.random.default_rng(0).uniform(size=(40, 20_000)), loss=0.1, burst=5.0)
+    bad = lost(default_rng(0).uniform(size=(40, 20_000)), loss=0.1, burst=5.0)
     starts = (bad[:, 1:] & ~bad[:, :-1]).sum()
     assert bad.mean() == pytest.approx(0.1, rel=0.03)
     assert bad.sum() / starts == pytest.approx(5.0, rel=0.03)
@@ -225,7 +227,7 @@ def test_unknown_and_unrecorded_egos(crossing):
 def test_a_stream_is_that_of_its_key(seed, run):
     """Against NumPy's own way from a tuple of numbers."""
     key = (seed, run, *(zlib.crc32(word.encode()) for word in ("gnss", "a", "b")))
-    wanted = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
+    wanted = Generator(Philox(SeedSequence(key)))
     assert stream(seed, "gnss", run, "a", "b").normal() == wanted.normal()
 
 

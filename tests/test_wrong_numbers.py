@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from conftest import refused, winding, without
 from filterpy.kalman import KalmanFilter
+from numpy import pi
 from numpy.linalg import norm, solve
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -71,11 +72,11 @@ def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
     gnss, relative = recording.gnss.copy(), recording.relative.copy()
     step, sender = recording.links.step[links], recording.links.neighbour[links]
     if kind == "range":
-        relative[run, links, 0] = np.abs(relative[run, links, 0] + size * np.sign(way[:, 0]))
+        relative[run, links, 0] = abs(relative[run, links, 0] + size * np.sign(way[:, 0]))
     elif kind == "azimuth":
-        relative[run, links, 1] = rng.uniform(-np.pi, np.pi, RUNS)
+        relative[run, links, 1] = rng.uniform(-pi, pi, RUNS)
     elif kind == "inclination":
-        relative[run, links, 2] = rng.uniform(0.0, np.pi, RUNS)
+        relative[run, links, 2] = rng.uniform(0.0, pi, RUNS)
     elif kind in ("fix", "message"):
         who = np.full(RUNS, EGO) if kind == "fix" else sender
         gnss[run, step, who] += size[:, None] * way / norm(way, axis=1, keepdims=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import inv
 from scipy.linalg import block_diag
 
 from ..arrays import Bools, Floats, Ints, checked, instance, refuse
@@ -258,7 +259,7 @@ def position_stages(
     own, common = (max(std**2, NO_ERROR) for std in (sensors.gnss_drift_std, sensors.gnss_common_std))
     keep, d = float(np.exp(-fleet.dt / sensors.gnss_drift_time)), 6 if drifts else 3
     behind = [len(fleet.ids)] if drifts else []
-    rows_of = [np.append(row, behind).astype(np.int64) for row in members]
+    rows_of = [np.append(row, behind).astype(int) for row in members]
     for now, previous, edges in steps_of(fleet, links, rows_of, measured and measured.relative):
         t, n, m = len(stages), len(now), len(now) - len(behind)
         motion, process, prior = np.ones((n, d)), np.zeros((n, d)), np.zeros((n, d))
@@ -319,7 +320,7 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
     motion[...] = np.eye(d)
     motion[..., :3, 3] = aside
     std = sensors.velocity_std(forward)
-    noise[..., :3, :3] = dt * turned(std[..., None] * np.eye(3), heading[..., None]).swapaxes(-1, -2)
+    noise[..., :3, :3] = dt * turned(std[..., None] * np.eye(3), heading[..., None]).mT
     noise[..., :3, 3], noise[..., 3, 3] = 0.5 * dt * sensors.yaw_rate_std * aside, dt * sensors.yaw_rate_std
     keep = float(np.exp(-dt / sensors.odometry_error_time))
     for column, kind in enumerate(lasting, 4):
@@ -330,7 +331,7 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
         if kind < 2:
             fresh = (sensors.speed_scale_std, sensors.yaw_rate_bias_std)[kind] * np.sqrt(1.0 - keep**2)
             motion[..., column, column], noise[..., column, column] = keep, fresh
-    return motion, noise @ noise.swapaxes(-1, -2)
+    return motion, noise @ noise.mT
 
 
 class Edges(NamedTuple):
@@ -385,7 +386,7 @@ def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats, *, posed
     information, ends = np.zeros((n, n, d, d)), ((observer, own), (np.maximum(neighbour, 0), other))
     for here, rows in ends:
         for there, others in ends:
-            np.add.at(information, (here, there), rows.swapaxes(1, 2) @ weight @ others)
+            np.add.at(information, (here, there), rows.mT @ weight @ others)
     return information.swapaxes(1, 2).reshape(n * d, n * d)
 
 
@@ -396,7 +397,7 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     flat = np.maximum(np.hypot(*edges.vector[:, :2].T), MIN_GROUND_DISTANCE)
     gradients = directions(azimuth, inclination) / np.stack([np.ones_like(away), flat, away], axis=1)[..., None]
     weight = np.square(std) ** -1.0 * edges.measured
-    return np.asarray(gradients.swapaxes(1, 2) @ (weight[..., None] * gradients))
+    return np.asarray(gradients.mT @ (weight[..., None] * gradients))
 
 
 def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Floats]]:
@@ -409,8 +410,8 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
         for t, stage in enumerate(stages):
             _, now, _, moved = _moved(cov, stage)
             information = np.diag(stage.prior.ravel())
-            information[np.ix_(now, now)] = np.linalg.inv(moved)  # (F P F^T + Q)^-1
-            cov = np.linalg.inv(information + stage.gained)
+            information[np.ix_(now, now)] = inv(moved)  # (F P F^T + Q)^-1
+            cov = inv(information + stage.gained)
             bar.update()
             if smoothing:
                 filtered.append(cov)
@@ -420,7 +421,7 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
             yield t, cov
             if t:
                 before, now, motion, moved = _moved(filtered[t - 1], stages[t])
-                gain = filtered[t - 1][:, before] @ motion.T @ np.linalg.inv(moved)
+                gain = filtered[t - 1][:, before] @ motion.T @ inv(moved)
                 cov = filtered[t - 1] + gain @ (cov[np.ix_(now, now)] - moved) @ gain.T
             bar.update()
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ..arrays import Floats, check_arrays, checked, number, one_of, refuse, remade, texts
 from ..errors import InputError
@@ -81,10 +81,10 @@ class Ledger:
 
 def of_training(
     names: Sequence[str],
-    sent: npt.ArrayLike,
-    received: npt.ArrayLike,
+    sent: ArrayLike,
+    received: ArrayLike,
     servers: Sequence[str] = (),
-    messages: npt.ArrayLike = 0.0,
+    messages: ArrayLike = 0.0,
     overhead: int = 0,
 ) -> Ledger:
     """The ledger of a training from payload bytes (V,) sent once and received.

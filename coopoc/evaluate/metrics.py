@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from numpy import errstate, nan
+from numpy.linalg import eigvalsh, norm, solve
 from scipy import special
 
 from ..arrays import Floats, checked, instance, number, refuse
@@ -18,14 +20,14 @@ from ..world.recording import Recording
 
 def errors(track: Track, fleet: Fleet) -> Floats:
     """Distance between estimate and truth, (R, T, E) m."""
-    return np.asarray(np.linalg.norm(_truth(track, fleet) - track.x, axis=-1))
+    return np.asarray(norm(_truth(track, fleet) - track.x, axis=-1))
 
 
 def _truth(track: Track, fleet: Fleet) -> Floats:
     """(T, E, 3) m of the egos; InputError if the fleet is not the one that was recorded."""
     track = instance("track", track, Track, "A method makes one of a recording: the track stands before the fleet.")
     fleet = instance("fleet", fleet, Fleet, "Score a track against its fleet: the track stands before the fleet.")
-    egos = np.array(track.egos, dtype=np.int64)
+    egos = np.array(track.egos, int)
     same_drive(fleet, (track.ids or fleet.ids)[: len(fleet.ids)], track.t)  # landmarks come last and have no truth
     hint = "Score a track against the fleet that its recording was observed from."
     refuse("track.egos", egos, egos >= len(fleet.ids), f"must be columns of the fleet, 0..{len(fleet.ids) - 1}", hint)
@@ -46,7 +48,7 @@ def rt_le(track: Track, fleet: Fleet) -> Floats:
     """
     squares, present = errors(track, fleet) ** 2, fleet.present[:, list(track.egos)]
     present = present if track.absent is None else present & ~track.absent
-    with np.errstate(invalid="ignore"):
+    with errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.sum(squares, axis=1, where=present) / present.sum(axis=0)))
 
 
@@ -90,8 +92,8 @@ def _require_sound(track: Track, p: Floats, square: Floats, method: str) -> None
     symmetric nor positive semidefinite to a share of 1e-6."""
     wrong = square < -1e-9
     if any(UNSOUND in note for note in track.notes):
-        own, skew = np.linalg.eigvalsh(np.nan_to_num(p))[..., 0], np.abs(p - np.swapaxes(p, -1, -2)).max(axis=(-1, -2))
-        wrong |= np.minimum(own, -skew) < -1e-6 * np.abs(p).max(axis=(-1, -2))
+        own, skew = eigvalsh(np.nan_to_num(p))[..., 0], abs(p - p.mT).max(axis=(-1, -2))
+        wrong |= np.minimum(own, -skew) < -1e-6 * abs(p).max(axis=(-1, -2))
     if wrong.any():
         run, step, ego = np.argwhere(wrong)[0]
         actual = f"{p[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
@@ -120,7 +122,7 @@ def share_of_average(average: Floats, runs: int) -> Floats:
     array([0.5])
     """
     low, high = nees_band(runs)
-    inside = np.where(np.isnan(average), np.nan, (average >= low) & (average <= high))
+    inside = np.where(np.isnan(average), nan, (average >= low) & (average <= high))
     return np.asarray(np.nanmean(inside, axis=0))
 
 
@@ -156,7 +158,7 @@ def pose_nees(track: Track, fleet: Fleet) -> Floats:
     """
     turn = heading_error(track, fleet)
     error = np.concatenate([(track.x - _truth(track, fleet))[..., :2], turn[..., None]], axis=-1)
-    solved = np.linalg.solve(pose_covariance(track), error[..., None])[..., 0]
+    solved = solve(pose_covariance(track), error[..., None])[..., 0]
     return np.asarray((error * solved).sum(axis=-1))
 
 
@@ -218,7 +220,7 @@ def fix_innovations(track: Track, recording: Recording) -> Floats:
     (5, 2, 1, 3)
     """
     of_recording(track, recording)
-    egos, innovations = list(track.egos), np.full(track.x.shape, np.nan)
+    egos, innovations = list(track.egos), np.full(track.x.shape, nan)
     moved = recording.dt * turned(recording.velocity[:, 1:, egos], _halfway(track, recording))
     innovations[:, 1:] = recording.gnss[:, 1:, egos] - (track.x[:, :-1] + moved)
     return innovations
@@ -251,9 +253,9 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
         shared, variance = np.split(track.heading_covariance[:, :-1], [3], axis=-1)
         aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])
         half = (shared + 0.5 * variance * aside)[..., None] * aside[..., None, :]
-        covariance += half + np.swapaxes(half, -1, -2)
-    squares, d = np.full(innovation.shape[:3], np.nan), innovation[:, 1:]
-    square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
+        covariance += half + half.mT
+    squares, d = np.full(innovation.shape[:3], nan), innovation[:, 1:]
+    square = np.einsum("...i,...i->...", d, solve(covariance, d[..., None])[..., 0])
     squares[:, 1:] = square / dimensions(recording)
     _require_sound(track, track.covariance, squares, "the method")
     return squares
@@ -283,7 +285,7 @@ def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
     """
     square = (fix_innovations(track, recording) ** 2).sum(axis=-1)
     count, normalised_square = np.isfinite(square).sum(axis=1), normalised_innovations(track, recording)
-    with np.errstate(invalid="ignore"):
+    with errstate(invalid="ignore"):
         columns = {"innovation_m": np.sqrt(np.nansum(square, axis=1) / count), "fixes": count.astype(float)}
         if normalised_square is not None:
             columns["nis"] = np.nansum(normalised_square, axis=1) / count

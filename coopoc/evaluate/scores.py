@@ -110,7 +110,7 @@ def causal(method: Method, recording: Recording, egos: Vehicles) -> bool:
     if not (there := [ego for ego in egos if half.stretches(ego, fixed=needs_fix(method))]):
         return True
     whole, part = (follow(method, each, there).x[:, : len(half.t)] for each in (first, half))
-    return not (np.abs(whole - part) > 1e-3).any()
+    return not (abs(whole - part) > 1e-3).any()
 
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:

@@ -1,8 +1,8 @@
 """Paired intervals: bootstrap over egos, then runs; training seeds apart."""
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
+from math import isfinite, nan
 
 import numpy as np
 
@@ -22,7 +22,7 @@ class Interval:
 
     >>> print(Interval(1.423, 1.391, 1.46, 100))
     1.42 [1.39, 1.46]
-    >>> print(Interval(1.423, math.nan, math.nan, 1))
+    >>> print(Interval(1.423, nan, nan, 1))
     1.42
     """
 
@@ -32,7 +32,7 @@ class Interval:
     n: int
 
     def __str__(self) -> str:
-        return f"{self.mean:.3g}" + (f" [{self.low:.3g}, {self.high:.3g}]" if math.isfinite(self.low) else "")
+        return f"{self.mean:.3g}" + (f" [{self.low:.3g}, {self.high:.3g}]" if isfinite(self.low) else "")
 
 
 def mean_interval(values: AnyArray) -> Interval:
@@ -54,7 +54,7 @@ def mean_interval(values: AnyArray) -> Interval:
     values = _checked("values", values)
     mean, n = float(values.mean()), len(values) if len(values) > 1 else values.shape[1]
     if n < 2:
-        return Interval(mean, math.nan, math.nan, values.size)
+        return Interval(mean, nan, nan, values.size)
     from scipy import special  # a fifth of a second, which a mistake on the command line need not wait for
 
     counts, step = _counts(*values.shape, RESAMPLES), max(1, _CHUNK // values.size)
@@ -111,11 +111,11 @@ def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
     """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each; the same draws for any
     values of one shape, so pairs stay pairs."""
     size, rng = egos * runs, np.random.default_rng(0)
-    counts = np.empty((resamples, size), dtype=np.uint16 if size < 2**16 else np.uint32)
+    counts = np.empty((resamples, size), np.uint16 if size < 2**16 else np.uint32)
     step = max(1, _CHUNK // size)
     for start in range(0, resamples, step):
         count = min(step, resamples - start)
-        ego = rng.integers(egos, size=(count, egos, 1)) if egos > 1 else np.zeros((count, 1, 1), dtype=np.int64)
+        ego = rng.integers(egos, size=(count, egos, 1)) if egos > 1 else np.zeros((count, 1, 1), int)
         run = rng.integers(runs, size=(count, egos, runs))
         index = (np.arange(count)[:, None, None] * egos + ego) * runs + run
         counts[start : start + count] = np.bincount(index.ravel(), minlength=count * size).reshape(count, size)

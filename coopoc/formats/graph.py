@@ -8,7 +8,7 @@ from functools import cached_property
 from operator import attrgetter
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
@@ -114,7 +114,7 @@ class RangeEdges(Edges):
     stamps: Floats = ()  # type: ignore[assignment]
 
 
-def edges_of(kind: str, nodes: npt.ArrayLike, values: Floats, covariance: Floats, stamps: npt.ArrayLike) -> Edges:
+def edges_of(kind: str, nodes: ArrayLike, values: Floats, covariance: Floats, stamps: ArrayLike) -> Edges:
     """Edges of a kind from the rows of a file.
 
     Args:
@@ -184,7 +184,7 @@ class Graph:
     def __post_init__(self, location: Callable[[str, int], str] | None) -> None:
         self.__dict__["names"] = tuple(self.names)
         self.__dict__["is_pose"] = frozen(self.is_pose, bool)
-        self.__dict__["fixed"] = frozen(self.fixed, np.int64)
+        self.__dict__["fixed"] = frozen(self.fixed, int)
         for field in ("position", "orientation", "stamps"):
             self.__dict__[field] = frozen(getattr(self, field))
         if not len(self.stamps):
@@ -325,14 +325,14 @@ def _values(edges: Edges, field: str, location: Location) -> None:
             covariance = getattr(edges, name)
             eigenvalues = np.linalg.eigvalsh(covariance)
             least = MATRIX_ROUNDING * np.maximum(eigenvalues[:, -1], 0)
-            uneven = np.abs(covariance - covariance.swapaxes(-1, -2)).max(axis=(-2, -1))
+            uneven = abs(covariance - covariance.mT).max(axis=(-2, -1))
             wrong, hint = (eigenvalues[:, 0] < -least) | (uneven > least), "Order of the upper triangle: by rows."
             _refuse(location, field, wrong, covariance, "must be symmetric and positive semi-definite", hint, actual)
 
 
 def _unit(orientation: Floats, field: str, location: Location) -> None:
     if orientation.shape[-1] == 4:
-        off = np.abs(np.linalg.norm(orientation, axis=1) - 1) > QUATERNION_ROUNDING
+        off = abs(np.linalg.norm(orientation, axis=1) - 1) > QUATERNION_ROUNDING
         allowed, hint = (
             f"must have length 1 to within {QUATERNION_ROUNDING:g}",
             "Order is qx qy qz qw; 0 0 0 1 is no rotation.",
@@ -341,13 +341,7 @@ def _unit(orientation: Floats, field: str, location: Location) -> None:
 
 
 def _refuse(
-    location: Location,
-    field: str,
-    wrong: npt.ArrayLike,
-    values: npt.ArrayLike,
-    allowed: str,
-    hint: str,
-    label: str = "",
+    location: Location, field: str, wrong: ArrayLike, values: ArrayLike, allowed: str, hint: str, label: str = ""
 ) -> None:
     """InputError at the first row that is wrong, with what is given there."""
     rows = np.flatnonzero(wrong)

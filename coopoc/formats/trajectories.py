@@ -3,15 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ..arrays import check_turns, checked, refuse
 from ..paths import given_path, write
 
 
-def write_tum(
-    path: str | Path, t: npt.ArrayLike, position: npt.ArrayLike, heading: npt.ArrayLike | None = None
-) -> None:
+def write_tum(path: str | Path, t: ArrayLike, position: ArrayLike, heading: ArrayLike | None = None) -> None:
     """Write a path as a TUM file, `t x y z qx qy qz qw` by rows, which evo and most SLAM tools read.
 
     Args:

@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy import nan
+from numpy.linalg import eigh, eigvalsh, inv
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
@@ -53,10 +55,10 @@ def to_numbers(file: str, lines: Sequence[int], words: Sequence[Sequence[str]], 
     values = np.empty((len(words), columns))
     for row, line in enumerate(words):
         try:
-            values[row] = [_number(word) for word in line] if len(line) == columns else np.nan
+            values[row] = [_number(word) for word in line] if len(line) == columns else nan
         except ValueError:
-            values[row] = np.nan
-    bad = np.flatnonzero(~(np.abs(values) <= MAX_NUMBER).all(axis=1))
+            values[row] = nan
+    bad = np.flatnonzero(~(abs(values) <= MAX_NUMBER).all(axis=1))
     if len(bad):
         raise malformed(file, lines[bad[0]], words[bad[0]], form)
     return values
@@ -107,7 +109,7 @@ def to_rotation(orientation: Floats) -> Floats:
     from scipy.spatial.transform import Rotation  # a quarter of a second, which a missing file need not wait for
 
     quaternions = orientation.reshape(-1, 4)
-    matrices, finite = np.full((len(quaternions), 3, 3), np.nan), np.isfinite(quaternions).all(axis=1)
+    matrices, finite = np.full((len(quaternions), 3, 3), nan), np.isfinite(quaternions).all(axis=1)
     matrices[finite] = Rotation.from_quat(quaternions[finite]).as_matrix()
     return matrices.reshape(*orientation.shape[:-1], 3, 3)
 
@@ -170,9 +172,9 @@ def inverse(matrices: Floats, location: Callable[[int], str], repairs: list[str]
     scale = np.exp2(np.rint(-0.5 * np.log2(np.where(positive, diagonal, 1))))
     both = scale[:, :, None] * scale[:, None, :]
     scaled = matrices * both
-    bad = np.flatnonzero(~positive.all(axis=-1) | (np.linalg.eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1))
+    bad = np.flatnonzero(~positive.all(axis=-1) | (eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1))
     for row in bad.tolist():
-        own, axes = np.linalg.eigh(scaled[row])
+        own, axes = eigh(scaled[row])
         if repairs is None or not own[-1] > 0:
             raise InputError(
                 location(row),
@@ -185,5 +187,5 @@ def inverse(matrices: Floats, location: Callable[[int], str], repairs: list[str]
         repairs.append(
             f"{location(row)}: information was not positive definite and was replaced by the nearest that is"
         )
-    inverses = np.linalg.inv(scaled) * both
-    return np.asarray(0.5 * (inverses + inverses.swapaxes(-1, -2)))
+    inverses = inv(scaled) * both
+    return np.asarray(0.5 * (inverses + inverses.mT))

@@ -156,7 +156,7 @@ def gated(problem: "Problem") -> "Problem":
 def centre(recording: Recording, upload: Message) -> tuple[Floats, Floats]:
     """Bytes (R, N) over the drive that every vehicle receives of a centre's answers, and sends of its `upload`."""
     links, overhead, present = recording.links, recording.v2x.overhead, recording.present
-    measured = np.zeros(present.shape, dtype=np.int64)
+    measured = np.zeros(present.shape, int)
     np.add.at(measured, (links.step, links.observer), 1)
     sent = (present * upload.size(overhead, measured)).sum(axis=0, dtype=float)
     received = present.sum(axis=0) * float(DOWNLOAD.size(overhead))
@@ -178,7 +178,7 @@ def counted(recording: Recording, active: Bools) -> Bools:
     ends = np.sort([links.observer, links.neighbour], axis=0)
     _, pair = np.unique(np.stack([links.step, *ends]), axis=1, return_inverse=True)
     arrives = (arrival >= 0) & (arrival - links.step <= recording.v2x.max_age / recording.dt + 1e-9)
-    heard = np.zeros((len(links), recording.runs), dtype=bool)
+    heard = np.zeros((len(links), recording.runs), bool)
     np.logical_or.at(heard, pair, arrives.T)
     return heard[pair].T & active[:, links.step, links.observer] & active[:, links.step, links.neighbour]
 

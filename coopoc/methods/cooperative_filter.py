@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy import inf
+from numpy.typing import ArrayLike
 
 from ..arrays import Floats, check_fields, number
 from ..kernels.gate import GATE
@@ -70,7 +71,7 @@ class Priors(NamedTuple):
     range_scale: float = 0.0
     pair_offset: float = 0.0
     absent: float = 8.0
-    exact: float = -np.inf
+    exact: float = -inf
     slip: float = 0.7
     fix: float = 1.0
     fix_gate: float = 16.0
@@ -88,7 +89,7 @@ ON_ROADS = Priors(
     offset=0.0,
     range_scale=0.03,
     pair_offset=0.3,
-    absent=-np.inf,
+    absent=-inf,
     exact=-4.0,
     fix=2.0,
     fix_gate=6.0,
@@ -108,10 +109,10 @@ class Broadcast(NamedTuple):
         odometer: (3,) m, sum of all its motions.
     """
 
-    position: npt.ArrayLike
-    velocity: npt.ArrayLike
-    variance: npt.ArrayLike
-    odometer: npt.ArrayLike
+    position: ArrayLike
+    velocity: ArrayLike
+    variance: ArrayLike
+    odometer: ArrayLike
 
 
 BROADCAST = Message("estimate, odometer and velocity", 3 * len(Broadcast._fields) + 2)
@@ -184,7 +185,7 @@ class CooperativeFilter(Checked):
     def __post_init__(self) -> None:
         check_fields(self)
         for name, value in self.priors._asdict().items():
-            least = -np.inf if name in ("absent", "exact") else 0.0
+            least = -inf if name in ("absent", "exact") else 0.0
             number(f"priors.{name}", value, least, allowed=">= 0", hint="Give Priors()._replace(...).")
 
     @property
@@ -343,7 +344,7 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
         white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
         time, (heading, bias) = sensors.gnss_drift_time, np.square(noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-        absent[3:5][np.array([bias, offset]) > 0.0] = -np.inf
+        absent[3:5][np.array([bias, offset]) > 0.0] = -inf
         bias, offset = bias or priors.compass**2, offset or priors.offset**2
     lasting = own, common, time, white, bias, heading, offset, turn, priors.lasts, ranged, absent, priors.exact
     judged = priors.slip, GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget

@@ -54,7 +54,7 @@ def doubts(
     """
     stated = noise_model.sensors if isinstance(noise_model, NoiseModel) else noise_model != "identity"
     sensors, links, steps, notes = recording.sensors, recording.links, len(recording.t), [*recording.unlikely]
-    egos, claimed = np.asarray(columns, dtype=np.int64), cov if cov is not None and stated else np.zeros((0,) * 5)
+    egos, claimed = np.asarray(columns, int), cov if cov is not None and stated else np.zeros((0,) * 5)
     fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
     fix[1] = fix[1].sum()
     every = max(min(round(JUDGED_SECONDS / recording.dt), steps // JUDGED_IN_A_ROW), 1)

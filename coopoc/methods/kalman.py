@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ..arrays import Floats, last_true
 from ..errors import InputError
@@ -55,7 +55,7 @@ class FilterStream:
         history: s, how old a delayed fix may be.
     """
 
-    def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: npt.ArrayLike | None, history: float) -> None:
+    def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
         self._state, self._given, self._noise = (
             np.full((3, len(STATE)), np.nan),
@@ -68,7 +68,7 @@ class FilterStream:
             self._state[:, 0] = three("x0", x0)
 
     def step(
-        self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
+        self, gnss: ArrayLike | None, velocity: ArrayLike, dt: float, fix_age: float = 0.0
     ) -> tuple[Floats, Floats | None]:
         """Position (3,) m and covariance (3, 3) m^2 now; NaN and None before the first fix.
 
@@ -132,7 +132,7 @@ class Kalman(Alone, Checked):
         return solo_track(recording, columns, x, p, began, assumed.notes, noise_model=assumed)
 
     def start(
-        self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
+        self, x0: ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
     ) -> FilterStream:
         """Start the filter for one step at a time: `step(gnss, velocity, dt, fix_age)`.
 
@@ -188,7 +188,7 @@ def start_of(x0: Floats | None, fixes: Floats) -> Floats:
 
 def solo_filter(
     recording: Recording,
-    columns: npt.ArrayLike,
+    columns: ArrayLike,
     noise: NoiseModel | MotionNoise,
     fixes: FixNoise,
     x0: Floats | None = None,

@@ -1,7 +1,8 @@
 """Inputs of streams: checks of a step, and the newest motions of a vehicle, which bring a late fix forward."""
 
 import numpy as np
-import numpy.typing as npt
+from numpy import nan
+from numpy.typing import ArrayLike
 
 from ..arrays import Floats, number, plain
 from ..errors import InputError, shown
@@ -18,7 +19,7 @@ class MotionHistory:
 
     def __init__(self, span: float) -> None:
         self.rows: Floats = np.zeros((65, 7))
-        self.rows[0, 3], self.rows[0, SQUARE] = number("history", span), np.nan
+        self.rows[0, 3], self.rows[0, SQUARE] = number("history", span), nan
 
     def __len__(self) -> int:
         return int(self.rows[0, 1])
@@ -38,14 +39,14 @@ class MotionHistory:
         """Add a step: dt s, motion (3,) m, its variance (3,) m^2."""
         push(self.reserve(), dt, moved, variance)
 
-    def forward(self, gnss: npt.ArrayLike | None, age: float) -> tuple[Floats, Floats]:
+    def forward(self, gnss: ArrayLike | None, age: float) -> tuple[Floats, Floats]:
         """A fix of `age` seconds ago moved to now, (3,) m, NaN for none, and the variance of that motion, (3,) m^2."""
         fix, moved, late = fix_or_none(gnss), np.zeros(3), np.zeros(3)
         if not np.isnan(fix).all():
             since(self.rows, age, moved, late)
         return fix + moved, late
 
-    def check(self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float) -> None:
+    def check(self, gnss: ArrayLike | None, velocity: ArrayLike, dt: float, fix_age: float) -> None:
         """InputError if a stream cannot take this step."""
         number(
             "dt", dt, ROUNDING, MAX_POSITION, allowed="finite and > 1 ns", hint="Give the seconds since the last step."
@@ -57,15 +58,13 @@ class MotionHistory:
         hint, allowed = "Leave such a fix out (None), or keep more: start(..., history=).", f"in 0..{kept:g} s"
         number("fix_age", fix_age, -ROUNDING, kept + ROUNDING, allowed=f"{allowed}, the motion that is kept", hint=hint)
 
-    def write(
-        self, row: Floats, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float
-    ) -> None:
+    def write(self, row: Floats, gnss: ArrayLike | None, velocity: ArrayLike, dt: float, fix_age: float) -> None:
         """Write fix, velocity, dt and age of the fix to the input of a kernel; InputError as `check`."""
         simple = isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= UNCHECKED
         try:
             if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
                 self.check(gnss, velocity, dt, fix_age)
-            row[:3], row[3:6], row[6], row[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+            row[:3], row[3:6], row[6], row[7] = nan if gnss is None else gnss, velocity, dt, fix_age
             if any(abs(number) > most for number, most in zip(row.tolist(), LARGEST, strict=True)):
                 self.check(gnss, velocity, dt, fix_age)
         except Exception:  # a class from elsewhere may raise anything
@@ -79,7 +78,7 @@ UNCHECKED = frozenset({list, tuple, np.ndarray, type(None)})
 """What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
 
 
-def three(field: str, value: npt.ArrayLike, limit: float = MAX_POSITION) -> Floats:
+def three(field: str, value: ArrayLike, limit: float = MAX_POSITION) -> Floats:
     """(3,) numbers within the limit; InputError naming the field if they are not.
 
     >>> three("velocity", [1, 2])
@@ -88,18 +87,18 @@ def three(field: str, value: npt.ArrayLike, limit: float = MAX_POSITION) -> Floa
     coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers within +-1e+08. Give east, north, up.
     """
     array = numbers(value)
-    if array.shape != (3,) or not (np.abs(array) <= limit).all():
+    if array.shape != (3,) or not (abs(array) <= limit).all():
         raise InputError(field, value, f"must be three finite numbers within +-{limit:g}", "Give east, north, up.")
     return array
 
 
-def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
+def fix_or_none(gnss: ArrayLike | None, field: str = "gnss") -> Floats:
     """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
-    fix = np.full(3, np.nan) if gnss is None else numbers(gnss)
+    fix = np.full(3, nan) if gnss is None else numbers(gnss)
     return fix if fix.shape == (3,) and np.isnan(fix).all() else three(field, "none" if gnss is None else gnss)
 
 
-def relative_vector(value: npt.ArrayLike) -> Floats:
+def relative_vector(value: ArrayLike) -> Floats:
     """(3,) range m and two angles rad, NaN where not measured; InputError for a range <= 0 and angles in degrees."""
     relative = numbers(value)
     if relative.shape != (3,) or not (0.0 < relative[0] < MAX_POSITION or np.isnan(relative[0])):
@@ -109,7 +108,7 @@ def relative_vector(value: npt.ArrayLike) -> Floats:
     return relative
 
 
-def numbers(value: npt.ArrayLike) -> Floats:
+def numbers(value: ArrayLike) -> Floats:
     """As an array of floats; an empty one of what holds no numbers.
 
     >>> numbers("east").size

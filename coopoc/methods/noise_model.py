@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy import inf, pi
 
 from ..arrays import TINY, Floats, Ints, check_fields, checked, instance, number, plain, refuse, remade, texts
 from ..errors import InputError, shown, suggestion
@@ -70,7 +71,7 @@ class NoiseModel:
         refuse(
             "compass",
             compass,
-            ~((compass >= 0) & (compass <= np.pi)),
+            ~((compass >= 0) & (compass <= pi)),
             "must be in 0..pi rad",
             "Convert degrees by np.deg2rad.",
         )
@@ -235,7 +236,7 @@ def _held_out(make: type[NoiseModel], recording: Recording, fleet: Fleet) -> tup
     fitted = make._constant(recording.between(0, split), fleet.between(0, split))
     change = errors(fitted) - errors(make.nominal(recording.sensors))
     if len(change) < 2:
-        return 0.0, np.inf
+        return 0.0, inf
     return float(change.mean()), float(t.ppf(0.975, len(change) - 1) * change.std(ddof=1) / np.sqrt(len(change)))
 
 
@@ -285,7 +286,7 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
     noise, links = noise_model.sensors, recording.relative.shape[1] if isinstance(recording, Recording) else 0
     if noise is None or recording is None or not links:
         return noise_model
-    sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(np.int64)]
+    sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(int)]
     measured = sample[np.isfinite(sample[:, 0])]
     directed = measured[np.isfinite(measured[:, 1])]
     if not len(measured):
@@ -347,7 +348,7 @@ def _resolvable(noise_model: NoiseModel) -> NoiseModel:
     if min(noise.relative_std) >= least:
         return noise_model
     names = ("range_std", "azimuth_std", "inclination_std")
-    raised = {name: max(getattr(noise, name), min(least, np.pi)) for name in names}
+    raised = {name: max(getattr(noise, name), min(least, pi)) for name in names}
     beside = f"finer ones beside a fix of {max(noise_model.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
     return replace(noise_model, sensors=replace(noise, **raised), notes=(*noise_model.notes, note))
@@ -357,7 +358,7 @@ def check_std(made: Any, field: str, least: float = TINY) -> None:
     """A tuple of three standard deviations in a field of a dataclass; InputError unless they are finite and at least
     that."""
     value = checked(field, getattr(made, field), "(3,)", (3,))
-    wrong, allowed = ~((value >= least) & (value < np.inf)), f"must be {'positive' if least else '>= 0'} and finite"
+    wrong, allowed = ~((value >= least) & (value < inf)), f"must be {'positive' if least else '>= 0'} and finite"
     refuse(field, value, wrong, allowed, "Give standard deviations of three axes.")
     made.__dict__[field] = tuple(value.tolist())
 
@@ -380,7 +381,7 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
     """White motion noise that is assumed of a recording with dt = `interval` s; None for the dt of each step."""
     interval = 0.0 if interval is None else check_interval(interval)
     if noise_model.process_std is not None:
-        return MotionNoise(np.array(noise_model.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
+        return MotionNoise(np.array(noise_model.process_std, float), np.zeros(3), 0.0, 0.0, interval)
     assert noise_model.sensors is not None
     return noise_model.sensors.motion_noise(interval)
 

@@ -79,8 +79,8 @@ def stars(
     r = np.broadcast_to(assumed_noise.fix_variance(recording), shape)
     fixes, variances = sent or (recording.gnss, r)
     variances = np.broadcast_to(variances, shape)
-    run, each = np.arange(recording.runs)[:, None], np.ones((recording.runs, 1), dtype=np.int64)
-    member, newest, uses = np.empty(0, np.int64), 0 * each[:, :0], 0 * each[:, :0]
+    run, each = np.arange(recording.runs)[:, None], np.ones((recording.runs, 1), int)
+    member, newest, uses = np.empty(0, int), 0 * each[:, :0], 0 * each[:, :0]
     for t in range(len(recording.t)):
         here = slice(messages.start[t], messages.start[t + 1])
         before, member = member, np.append(ego, recording.links.neighbour[messages.link[here]])

@@ -1,12 +1,13 @@
 """Streaming with neighbours: the star around one vehicle, fed step by step with measurements and messages."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from numpy import nan
+from numpy.typing import ArrayLike
 
 from ..arrays import Floats, Ints, instance, number, refuse
 from ..errors import InputError, shown
@@ -59,21 +60,21 @@ class RelativeMeasurement:
     """
 
     id: str
-    relative: npt.ArrayLike
-    gnss: npt.ArrayLike | None = None
-    velocity: npt.ArrayLike | None = None
-    variance: npt.ArrayLike | None = None
-    odometer: npt.ArrayLike | None = None
+    relative: ArrayLike
+    gnss: ArrayLike | None = None
+    velocity: ArrayLike | None = None
+    variance: ArrayLike | None = None
+    odometer: ArrayLike | None = None
     age: float = 0.0
     row: bytes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        row = np.full(WIDTH, np.nan)
+        row = np.full(WIDTH, nan)
         if not (isinstance(self.id, str) and self.id):
             raise InputError("id", shown(self.id), "must be a name", 'Give for example "b".')
         relative = relative_vector(self.relative)
         row[:AGE], row[AGE] = (
-            components(drop_steep_azimuths(relative)[None, None], np.zeros(1, np.int64))[0, 0],
+            components(drop_steep_azimuths(relative)[None, None], np.zeros(1, int))[0, 0],
             number("age", self.age),
         )
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
@@ -136,7 +137,7 @@ class StarStream:
     def __init__(
         self,
         filter: CooperativeFilter,
-        x0: npt.ArrayLike | None = None,
+        x0: ArrayLike | None = None,
         *,
         interval: float | None = None,
         history: float = 10.0,
@@ -144,7 +145,7 @@ class StarStream:
         measured: bool = False,
     ) -> None:
         noise_model = constant_noise(instance("filter", filter, CooperativeFilter).noise_model)
-        self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
+        self._start = np.full(3, nan) if x0 is None else three("x0", x0)
         priors = priors_of(filter, noise_model, measured)
         self._trusted, self._model = float(priors.fix_gate == 0.0), model_of(noise_model, priors)
         self._filter, self._tries = make_filter(1, 1)
@@ -153,9 +154,9 @@ class StarStream:
         self.max_age, self.history = number("max_age", max_age), MotionHistory(history)
         self._given, self._time = np.zeros(8), 0.0
         self._numbers, self._names = dict[str, int](), list[str]()
-        self._last: Floats = np.full((1, WIDTH), np.nan)
-        self._answer: Floats = np.full(12, np.nan)
-        self._memory: Floats = np.append(np.zeros(9), np.full(3, np.nan))
+        self._last: Floats = np.full((1, WIDTH), nan)
+        self._answer: Floats = np.full(12, nan)
+        self._memory: Floats = np.append(np.zeros(9), np.full(3, nan))
         self._odometry: Floats = new_state(self._motion) if priors.fix_gate else np.empty((0, 0))
         if x0 is not None:
             self._memory[:6] = *self._start, *np.full(3, 1.0 / START_VARIANCE)
@@ -180,8 +181,8 @@ class StarStream:
 
     def step(
         self,
-        gnss: npt.ArrayLike | None,
-        velocity: npt.ArrayLike,
+        gnss: ArrayLike | None,
+        velocity: ArrayLike,
         dt: float,
         fix_age: float = 0.0,
         neighbours: Sequence[RelativeMeasurement] = (),
@@ -223,7 +224,7 @@ class StarStream:
         own[FIX_VARIANCE:MOTION] -= (1.0 - self._model.white) * self._fix
         answer = np.empty(12 + 3 * len(columns))
         if not stream_step(self._filter, self._tries, self._model, own, rows, columns, self._start, answer):
-            return np.full(3, np.nan), None
+            return np.full(3, nan), None
         self._names, self._answer = names, answer
         return self._answer[:3], self._answer[3:12].reshape(3, 3)
 
@@ -232,7 +233,7 @@ class StarStream:
         if new := [name for name in names if name not in self._numbers]:
             self._meet(new, names)
         self._reserve(1 + len(names), len(self._last))
-        return np.array([self._numbers[name] for name in names], np.int64)
+        return np.array([self._numbers[name] for name in names], int)
 
     def _meet(self, new: list[str], names: list[str]) -> None:
         """Number new vehicles; forget those that are in no star that is remembered, and whose messages are too old."""
@@ -248,10 +249,10 @@ class StarStream:
         free = sorted(set(range(1, len(self._last))) - set(self._numbers.values()))
         for name, number in zip(new, free, strict=False):
             self._numbers[name] = number
-            self._last[number], self._last[number, AGE] = np.nan, -math.inf
+            self._last[number], self._last[number, AGE] = nan, -inf
             status = self._filter.status[number]
             status[:] = 0.0
-            status[TRUSTED], status[USED], status[SINCE] = self._trusted, -math.inf, -math.inf
+            status[TRUSTED], status[USED], status[SINCE] = self._trusted, -inf, -inf
 
     def _reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""

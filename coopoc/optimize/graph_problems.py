@@ -91,7 +91,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
             "and nothing places one to another"
         )
-    if graph.dimension == 2 and (beyond := int((np.abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
+    if graph.dimension == 2 and (beyond := int((abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
         notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
     won = Search(first)
     if start == "auto":

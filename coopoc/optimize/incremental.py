@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ..arrays import Floats, checked, instance, named, number
 from ..errors import InputError, shown
@@ -45,7 +45,7 @@ class Incremental:
         self._step(problem, range(len(self.names)), initial_guess(problem))
 
     def add(
-        self, factors: Iterable[Factor | Sequence[Any]] = (), values: Mapping[str, npt.ArrayLike] | None = None
+        self, factors: Iterable[Factor | Sequence[Any]] = (), values: Mapping[str, ArrayLike] | None = None
     ) -> None:
         """One step of iSAM2 with new measurements, and first guesses of the nodes that are new.
 

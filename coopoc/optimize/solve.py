@@ -6,6 +6,7 @@ from itertools import chain, islice
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 
 from ..arrays import Floats, instance
 from ..errors import InputError
@@ -22,13 +23,12 @@ from .model.problem import Problem, Search
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import converted, directed, guessed, initial_guess, undirected
-from .starts.mirrors import scaled
+from .starts.mirrors import RANGES, RIVAL_COST, scaled
 from .starts.race import (
     ELSEWHERE,
     FIRST_STEPS,
     QUIET_DRAWS,
     RACE_TOLERANCE,
-    RIVAL_COST,
     doubts,
     drawn,
     higher,
@@ -49,6 +49,8 @@ DRAWN_STEPS = 20
 """From each random place, of problems with constraints."""
 ASTRAY_SHARE = 0.25
 """Share of the extent of points by which an x0 may err and its `smooth` way needs no random starts beside it."""
+IMAGED = (*RANGES, "antenna")
+"""Formulas of several nodes whose other minima are images; beside a near x0 others are sought from random places."""
 COINCIDENT, AWAY = 1e-3, 1e4
 """Shares of the median distance of nodes from their middle below which two coincide and beyond which one is lost."""
 FEASIBLE = 1e-6
@@ -225,15 +227,18 @@ def _challenged(
     cost = system.cost(x)
     if not np.isfinite(cost) or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
-    straight, search = smooth(record), problem.search
-    near = (straight and (whole or bool(problem.poses))) or record[0, 0] - cost <= RIVAL_COST
+    search = problem.search
+    near = record[0, 0] - cost <= RIVAL_COST or ((whole or bool(problem.poses)) and smooth(record))
     if near and (whole or search.start):
         return problem, first
     if near:
-        other, won = race(problem, {}, {}, reached=x)
+        strange = any(f.measurement.frame == "nodes" and f.kind not in IMAGED for f in problem.factors)
+        other, won = race(problem, {}, {}, draws=strange, reached=x)
+        if not won.iterations:
+            return problem, first
     else:
-        astray = np.abs(x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(x, axis=0).max()
-        other = _measured(problem, x, bool(not whole and (astray or not straight)))
+        astray = abs(x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(x, axis=0).max()
+        other = _measured(problem, x, bool(not whole and (astray or not smooth(record))))
         won = other.search
     saved = cost - (least := system.cost(np.asarray(other.x0)))
     if higher(cost, least) and (not near or saved > RIVAL_COST):
@@ -294,14 +299,14 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
 def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) -> Iterator[str]:
     """Why nodes x (n, ambient) are no minimum that stands: a node far away, two that coincide, a step that is left."""
     at, names = problem.space.position(x), problem.names
-    off = np.linalg.norm(at - np.median(at, axis=0), axis=1)
+    off = norm(at - np.median(at, axis=0), axis=1)
     extent, lost = np.median(off), (off * problem.movable.any(axis=1)).argmax()
     if off[lost] > AWAY * extent > 0.0:
         yield f"{names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby"
     if status is Status.SOLVED:
         return
     pairs = stacked((f.nodes for f in problem.factors if f.nodes.shape[1] == 2), 2)
-    gap = np.linalg.norm(np.diff(at[pairs][..., :2], axis=1), axis=(1, 2))
+    gap = norm(np.diff(at[pairs][..., :2], axis=1), axis=(1, 2))
     for i, j in pairs[gap < COINCIDENT * extent][:1]:
         yield f"{names[i]} and {names[j]} nearly coincide, or differ in height alone: no direction has a derivative"
     if status is Status.FAILED:

@@ -154,7 +154,7 @@ def check() -> int:
         kind = "range" if backend.capabilities.lacking(tiny()) else "spherical"
         expected = solve(tiny(kind))
         solution = solve(tiny(kind), name, throw=False)
-        off = float(np.abs(solution.x - expected.x).max())
+        off = float(abs(solution.x - expected.x).max())
         good = solution.status is Status.SOLVED and off < 1e-6
         failed += not good
         print(f"{name:<14} {fixed:<12} {solution.status.name:<10} {solution.cost:12.6g} {off:11.1e}  {kind}")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+from pandas import DataFrame
 
 from ..arrays import Floats
 from ..errors import InputError, unknown
@@ -42,8 +43,8 @@ class Results:
     question: str
     axes: tuple[str, ...]
     settings: Params
-    frame: pd.DataFrame
-    failures: pd.DataFrame
+    frame: DataFrame
+    failures: DataFrame
     pending: int
     environment: Mapping[str, str]
 
@@ -84,7 +85,7 @@ class Results:
         """Number of failed cells."""
         return len(self.failures)
 
-    def select(self, where: Params | None = None, **also: Any) -> pd.DataFrame:
+    def select(self, where: Params | None = None, **also: Any) -> DataFrame:
         """Rows where each named column has the value, or one of a list of values.
 
         Raises:
@@ -117,7 +118,7 @@ class Results:
         """Mean of one metric over egos and runs with its interval."""
         return mean_interval(self.values(value, where, **also))
 
-    def groups(self, by: Sequence[str], where: Params | None = None) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
+    def groups(self, by: Sequence[str], where: Params | None = None) -> Iterator[tuple[tuple[Any, ...], DataFrame]]:
         """Rows of each combination of the columns `by`, in the order of the grid; InputError if `where` leaves none."""
         frame = self.select(where)
         if frame.empty and where:
@@ -127,7 +128,7 @@ class Results:
                 raise unknown("column", name, frame.columns)
         yield from frame.groupby(list(by), sort=False, dropna=False)
 
-    def summary(self, by: Sequence[str], value: str, where: Params | None = None) -> pd.DataFrame:
+    def summary(self, by: Sequence[str], value: str, where: Params | None = None) -> DataFrame:
         """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (egos left out).
 
         A metric that a combination does not have at all is NaN with n = 0.
@@ -141,9 +142,9 @@ class Results:
             grid, missing = ego_by_run(frame, value)
             each = mean_interval(grid.T) if grid.size else NO_VALUES
             rows.append([*names, each.mean, each.low, each.high, each.n, missing])
-        return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
+        return DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
-    def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
+    def _one_cell(self, frame: DataFrame, by: Sequence[str], value: str) -> None:
         if value not in frame:
             raise unknown("metric", value, frame.columns)
         if len(scores := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(scores):
@@ -158,11 +159,11 @@ def _is(column: "pd.Series[Any]", value: Any) -> "pd.Series[bool]":
     return column.isna() if value is None else column == value
 
 
-def _joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
-    return pa.concat_tables(tables, promote_options="permissive").to_pandas() if tables else pd.DataFrame()
+def _joined(tables: Sequence[pa.Table]) -> DataFrame:
+    return pa.concat_tables(tables, promote_options="permissive").to_pandas() if tables else DataFrame()
 
 
-def ego_by_run(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
+def ego_by_run(frame: DataFrame, value: str) -> tuple[Floats, int]:
     """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing.
 
     A run without a value of any ego is left out.

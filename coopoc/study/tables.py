@@ -2,10 +2,10 @@
 
 import csv
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from math import isfinite, isnan
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -162,13 +162,13 @@ class Table:
                 mean = entry.mean if isinstance(entry, Interval) else entry
                 text = escaped(self._number(mean) if isinstance(mean, float) else "–" if mean is None else str(mean))
                 texts.append(strong.format(text) if (i, j) in bold else text)
-                if isinstance(entry, Interval) and self.intervals and not math.isnan(entry.low):
+                if isinstance(entry, Interval) and self.intervals and not isnan(entry.low):
                     texts[-1] += ends.format(f"[{self._number(entry.low)}, {self._number(entry.high)}]")
             body.append(texts)
         return body
 
     def _number(self, value: float) -> str:
-        return "–" if math.isnan(value) else f"{value:.{self.decimals}f}"
+        return "–" if isnan(value) else f"{value:.{self.decimals}f}"
 
     def _sides(self, left: str, right: str) -> tuple[str, ...]:
         """Alignment of each column: text at the left, numbers at the right."""
@@ -193,7 +193,7 @@ class Table:
             for j, entry in enumerate(row):
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                if isinstance(mean, float) and math.isfinite(mean) and not (names & UNRANKED or smooths(names)):
+                if isinstance(mean, float) and isfinite(mean) and not (names & UNRANKED or smooths(names)):
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         return [sorted(group, reverse=self.best == "max") for group in places.values()]
 

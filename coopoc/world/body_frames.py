@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy import nan, pi
 
 from ..arrays import TINY, Floats
 from ..errors import InputError
@@ -27,13 +28,13 @@ def true_heading(fleet: Fleet) -> Floats:
     if fleet.heading is not None:
         return fleet.heading
     x, y = fleet.velocity[..., 0], fleet.velocity[..., 1]
-    course = np.where(np.hypot(x, y) >= STANDING_SPEED_M_S, np.arctan2(y, x), np.nan)
+    course = np.where(np.hypot(x, y) >= STANDING_SPEED_M_S, np.arctan2(y, x), nan)
     for column in course.T:
         finite = np.flatnonzero(np.isfinite(column))
         held = np.searchsorted(finite, np.arange(len(column)), side="right") - 1
         column[:] = np.unwrap(column[finite])[np.maximum(held, 0)] if len(finite) else 0.0
     course[1:-1] = (course[1:-1] + course[2:]) / 2
-    return np.where(fleet.present, course, np.nan)
+    return np.where(fleet.present, course, nan)
 
 
 def turned(vector: Floats, angle: Floats) -> Floats:
@@ -62,8 +63,8 @@ def body_motion(fleet: Fleet) -> tuple[Floats, Floats]:
     """True velocity (T, N, 3) m/s, forward, left and up, and yaw rate (T, N) rad/s over the step that ends at t."""
     heading = true_heading(fleet)
     change = np.nan_to_num(np.diff(heading, axis=0, prepend=heading[:1]))
-    turns = np.round(change / (2 * np.pi))  # between headings that are wrapped
-    rate = np.where(fleet.present, (change - 2 * np.pi * turns) / fleet.dt, np.nan)
+    turns = np.round(change / (2 * pi))  # between headings that are wrapped
+    rate = np.where(fleet.present, (change - 2 * pi * turns) / fleet.dt, nan)
     return turned(fleet.velocity, -midway(heading)), rate
 
 
@@ -81,7 +82,7 @@ def in_world(recording: Recording) -> Recording:
     """
     body = check_recording(recording, body=True).body
     assert body is not None
-    needed = np.abs(recording.velocity).sum(axis=-1) > 0
+    needed = abs(recording.velocity).sum(axis=-1) > 0
     needed[:, recording.links.step, recording.links.observer] = True
     if np.isnan(body.heading[needed]).any():
         _, step, column = np.argwhere(needed & np.isnan(body.heading))[0]
@@ -133,7 +134,7 @@ def body_measurements(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> t
     motion, rate = body_motion(fleet)
     heading, noise = true_heading(fleet), sensors.velocity_std(motion)
     velocity, yaw = np.empty((runs, *motion.shape)), np.empty((runs, *rate.shape))
-    compass = np.full(yaw.shape, np.nan)
+    compass = np.full(yaw.shape, nan)
     for r in range(runs):
         scale = _lasting(fleet, "speed_scale", sensors.speed_scale_std, sensors, (seed, r))
         bias = _lasting(fleet, "yaw_rate_bias", sensors.yaw_rate_bias_std, sensors, (seed, r))

@@ -25,8 +25,8 @@ def lost(draws: Floats, loss: float, burst: float) -> Bools:
         return np.full(draws.shape, bool(loss))
     mean_run = max(burst, 1.0 / (1.0 - loss))
     to_bad, stay_bad = loss / (mean_run * (1.0 - loss)), 1.0 - 1.0 / mean_run
-    bad = np.empty(draws.shape, dtype=bool)
-    state = draws[:, 0] < loss if draws.shape[1] else np.zeros(len(draws), dtype=bool)
+    bad = np.empty(draws.shape, bool)
+    state = draws[:, 0] < loss if draws.shape[1] else np.zeros(len(draws), bool)
     for k in range(draws.shape[1]):
         if k:
             state = draws[:, k] < np.where(state, stay_bad, to_bad)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Bools, Floats, check_arrays, check_fields, checked, listed, number, refuse, remade
 from ..errors import InputError, shown, unknown
@@ -206,7 +206,7 @@ def check_steps(start: int, stop: int, least: int) -> None:
         number(name, step, least, 2**62, kind=int, allowed="a step", hint="Count steps from 0.")
 
 
-def clock(t: npt.ArrayLike) -> Floats:
+def clock(t: ArrayLike) -> Floats:
     """Instants (T,) s as a read-only array.
 
     Raises:

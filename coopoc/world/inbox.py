@@ -78,12 +78,12 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
 def _newest(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Ints, Bools]:
     """Newest sending step held and whether that is new, (R, M) both, of messages of several neighbours."""
     if (arrival == sent).all():
-        return np.broadcast_to(sent, arrival.shape).copy(), np.ones(arrival.shape, dtype=bool)
-    newest, fresh = np.empty(arrival.shape, dtype=np.int64), np.empty(arrival.shape, dtype=bool)
+        return np.broadcast_to(sent, arrival.shape).copy(), np.ones(arrival.shape, bool)
+    newest, fresh = np.empty(arrival.shape, int), np.empty(arrival.shape, bool)
     for one in np.unique(neighbour):
         pair = np.flatnonzero(neighbour == one)
         run, k = np.nonzero(arrival[:, pair] >= 0)
-        held = np.full((len(arrival), steps), -1, dtype=np.int64)
+        held = np.full((len(arrival), steps), -1, int)
         np.maximum.at(held, (run, arrival[run, pair[k]]), sent[pair[k]])
         newest[:, pair] = held = np.maximum.accumulate(held, axis=1)[:, sent[pair]]
         fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0

@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy import pi
 
 from ..arrays import Bools, Floats, Ints, checked, frozen, number, refuse, remade
 
@@ -45,7 +46,7 @@ class Links:
         itself = self.neighbour == self.observer
         refuse("links.neighbour", self.neighbour, itself, "must differ from the observer", "Drop the link.")
         pair = np.cumsum((forward != 0) | (aside != 0)) * (self.neighbour.max(initial=0) + 1) + self.neighbour
-        order, twice = np.argsort(pair), np.zeros(len(pair), dtype=bool)
+        order, twice = np.argsort(pair), np.zeros(len(pair), bool)
         twice[order[1:]] = np.diff(pair[order]) == 0
         allowed = "must stand once for each step and observer"
         refuse("links.neighbour", self.neighbour, twice, allowed, "Keep one measurement of a pair in a step.")
@@ -55,7 +56,7 @@ class Links:
         number("observer", observer, -(2**62), 2**62, kind=int, allowed="a column", hint="Count columns from 0.")
         order, start = self._by_observer
         if not 0 <= observer < len(start) - 1:
-            return np.empty(0, dtype=np.int64)
+            return np.empty(0, int)
         return order[start[observer] : start[observer + 1]]
 
     @cached_property
@@ -114,7 +115,7 @@ def drop_steep_azimuths(relative: Floats) -> Floats:
     >>> drop_steep_azimuths(np.array([9.0, 0.5, 0.1])).tolist()
     [9.0, nan, 0.1]
     """
-    steep = np.abs(np.abs(relative[..., 2:]) - np.pi / 2) > np.pi / 2 - STEEP
+    steep = abs(abs(relative[..., 2:]) - pi / 2) > pi / 2 - STEEP
     return np.where(steep & (np.arange(3) == 1), np.nan, relative) if steep.any() else relative
 
 
@@ -135,7 +136,7 @@ def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     reach = np.maximum(d, min_range)
     metres = std * np.stack([np.ones_like(d), reach * np.sin(inclination), reach], axis=-1)
     root = metres[..., None] * directions(azimuth, inclination)
-    cov: Floats = np.swapaxes(root, -1, -2) @ root
+    cov: Floats = root.mT @ root
     return cov
 
 
@@ -166,4 +167,4 @@ def wrap(angle: Any) -> Any:
     >>> round(float(wrap(3.5)), 4)
     -2.7832
     """
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    return (angle + pi) % (2 * pi) - pi

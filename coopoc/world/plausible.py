@@ -25,7 +25,7 @@ def plausible(field: str, values: Floats, limit: float, hint: str = "Is it in an
         return
     largest = max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None))
     if largest > limit:
-        refuse(field, values, np.abs(values) > limit, f"must be within +-{limit:g} in SI units", hint)
+        refuse(field, values, abs(values) > limit, f"must be within +-{limit:g} in SI units", hint)
     if (step := float(np.spacing(np.float32(largest)))) > COARSE_SPACING and limit == MAX_POSITION:
         there = values[np.isfinite(values)]
         rounded = np.full(values.shape, bool((there == there.astype(np.float32)).all() and (there % 1).any()))
@@ -48,11 +48,11 @@ def headings(values: Floats, velocity: Floats | None = None) -> None:
     """InputError for headings (..., T, N) in degrees. They may be unwrapped, but do not jump by more than two turns, as
     degrees do at 360, and beyond two turns are no courses of velocities (T, N, 3) m/s once they are converted."""
     radians("heading", values, UNWRAPPED)
-    wrong, far = np.abs(np.diff(values, axis=-2, prepend=values[..., :1, :])) > TWO_TURNS, np.abs(values) > TWO_TURNS
+    wrong, far = abs(np.diff(values, axis=-2, prepend=values[..., :1, :])) > TWO_TURNS, abs(values) > TWO_TURNS
     if velocity is not None and far.any():
-        moving = far & (np.abs(velocity[..., :2]).max(axis=-1) > 1.0)
+        moving = far & (abs(velocity[..., :2]).max(axis=-1) > 1.0)
         course = np.arctan2(velocity[..., 1], velocity[..., 0])
-        off = [np.abs(wrap(turn - course))[moving] for turn in (values, np.deg2rad(values))]
+        off = [abs(wrap(turn - course))[moving] for turn in (values, np.deg2rad(values))]
         wrong |= moving & bool(moving.any() and np.median(off[1]) < min(0.2, np.median(off[0])))
     refuse(
         "heading",

@@ -380,7 +380,7 @@ def check_links(
         refuse(
             f"links.{name}", column, gone, "must be present at the link's step", "Drop the links of absent vehicles."
         )
-    many, first = np.zeros(len(counted), dtype=bool), max(len(counted) - most, 0)
+    many, first = np.zeros(len(counted), bool), max(len(counted) - most, 0)
     step, observer = links.step[counted], links.observer[counted]
     many[most:] = (step[most:] == step[:first]) & (observer[most:] == observer[:first])
     refuse("links.observer", observer, many, f"must have at most max_neighbours = {most} a step", "Raise it.")
@@ -398,7 +398,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
     ]
     if recording.body is None and recording.tags.any():
         sentences.append(
-            f"ranges between tags up to {np.abs(recording.tags).max():.2g} m from their vehicles are those between "
+            f"ranges between tags up to {abs(recording.tags).max():.2g} m from their vehicles are those between "
             'vehicles, as methods of positions take them; a PoseFilter (frame="body") takes off the tags'
         )
     if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
@@ -421,12 +421,12 @@ def _contradicting(recording: Recording) -> float:
     ends = (values[newest, column] for values in (fixes, path, np.cumsum(np.isnan(u), axis=0)))
     moved, driven, gaps = (np.diff(values, axis=0) for values in ends)
     turn = np.exp(1j * (heading - turned))[newest[:-1], column]
-    moved, driven = np.where(np.isnan(turn), (np.abs(moved), np.abs(driven)), (moved, driven * turn))
-    rough = np.abs(np.diff(fixes, 2, axis=0))  # of white noise sqrt(6) times a fix's
+    moved, driven = np.where(np.isnan(turn), (abs(moved), abs(driven)), (moved, driven * turn))
+    rough = abs(np.diff(fixes, 2, axis=0))  # of white noise sqrt(6) times a fix's
     noise = max(np.median(rough[np.isfinite(rough)]) / 2.0 if np.isfinite(rough).any() else 0.0, stated)
-    short, long = np.sort([np.abs(moved), np.abs(driven)], axis=0)
+    short, long = np.sort([abs(moved), abs(driven)], axis=0)
     far = (long > LONG_STDS * noise) & (short > noise)
     far &= (newest[:-1] >= 0) & (np.diff(newest, axis=0) > 0) & (gaps == 0)
-    apart = far & (np.abs(moved - driven) > APART_SHARE * (np.abs(moved) + np.abs(driven)))
+    apart = far & (abs(moved - driven) > APART_SHARE * (abs(moved) + abs(driven)))
     share = float(apart.sum() / max(far.sum(), 1))
     return share if share > CONTRADICTING_SHARE and far.sum() > 2 else 0.0

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy import inf, nan
+from numpy.linalg import norm
 
 from ..arrays import Bools, Floats, Ints, instance, last_true, one_of, runs_in_memory, seed_of
 from ..errors import InputError
@@ -127,14 +129,14 @@ def find_links(
         min_range: m.
         landmarks: columns of members that are linked beside the K, and observe nothing.
     """
-    links = [np.empty((0, 3), dtype=np.int64)]
-    vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
+    links = [np.empty((0, 3), int)]
+    vehicles, columns = len(fleet.ids), np.array(list(observers), int)
     columns, marks = np.setdiff1d(columns, landmarks), np.isin(np.arange(vehicles), landmarks)
     at_once = max(1, PAIRS_AT_ONCE // (vehicles * max(1, len(columns))))
     for first in range(0, len(fleet.t), at_once) if (v2x.max_neighbours or marks.any()) and len(columns) else ():
         position = fleet.position[first : first + at_once]
         observer, other = _near(position, columns, v2x.radius)
-        gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[observer], axis=1)
+        gap = norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[observer], axis=1)
         fits = (gap <= v2x.radius) & (gap >= min_range) & (observer != other)
         observer, other, gap = observer[fits], other[fits], gap[fits]
         order = np.lexsort((other, gap, observer))
@@ -225,7 +227,7 @@ def _relative_measurements(
             relative[r, index] = draws[step]
         relative[r] *= sensors.relative_std
         relative[r] += exact
-        relative[r, :, 0] = np.abs(relative[r, :, 0] + longer[r])
+        relative[r, :, 0] = abs(relative[r, :, 0] + longer[r])
         relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
     if sensors.outliers:
         reach = sensors.min_range, v2x.radius
@@ -315,9 +317,9 @@ def wrong_fixes(gnss: Floats, fleet: Fleet, outliers: Outliers, seed: int, remov
         up, around = 2.0 * jump.turn[:, 0] - 1.0, 2.0 * np.pi * jump.turn[:, 1]
         flat = np.sqrt(1.0 - up**2)
         error = jump.size[:, None] * np.stack([flat * np.cos(around), flat * np.sin(around), up], axis=-1)
-        gnss[r, jump.wrong, column] += np.nan if remove_outliers else error[jump.wrong]
+        gnss[r, jump.wrong, column] += nan if remove_outliers else error[jump.wrong]
     for r, column, gap in _of_vehicles("outages", outliers.outages, fleet, len(gnss), seed):
-        gnss[r, gap.wrong, column] = np.nan
+        gnss[r, gap.wrong, column] = nan
 
 
 def wrong_odometry(
@@ -368,10 +370,10 @@ def wrong_relative(
             one, other = sorted((observer, neighbour))
             late = episodes(outliers.ranges, (seed, "outlier ranges", r, one, other), steps, dt)
             hit = late.wrong[step]
-            relative[r, index[hit], 0] += np.nan if remove_outliers else late.size[step[hit]]
+            relative[r, index[hit], 0] += nan if remove_outliers else late.size[step[hit]]
     if not outliers.angles.rate:
         return
-    mistaken = np.zeros(relative.shape[:2], dtype=bool)
+    mistaken = np.zeros(relative.shape[:2], bool)
     for r in range(len(relative)):
         for observer, neighbour, index, step in pairs:
             faulty = episodes(outliers.angles, (seed, "outlier angles", r, observer, neighbour), steps, dt)
@@ -380,8 +382,8 @@ def wrong_relative(
     error, mistakable = mistaken_angles(fleet, links, at, reach)
     run, row = np.nonzero(mistaken[:, at] & mistakable)
     wrong = run, at[row]
-    relative[(*wrong, 1)] = wrap(relative[(*wrong, 1)] + (np.nan if remove_outliers else error[row, 0]))
-    relative[(*wrong, 2)] += np.nan if remove_outliers else error[row, 1]
+    relative[(*wrong, 1)] = wrap(relative[(*wrong, 1)] + (nan if remove_outliers else error[row, 0]))
+    relative[(*wrong, 2)] += nan if remove_outliers else error[row, 1]
 
 
 def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, float]) -> tuple[Floats, Bools]:
@@ -394,17 +396,17 @@ def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, fl
         at: M indices of links.
         reach: (min_range, radius) m.
     """
-    error, done = np.zeros((len(at), 2)), np.zeros(len(at), dtype=bool)
+    error, done = np.zeros((len(at), 2)), np.zeros(len(at), bool)
     at_once = max(1, PAIRS_AT_ONCE // len(fleet.ids))
     for first in range(0, len(at), at_once):
         part = slice(first, first + at_once)
         step, observer, neighbour = (side[at[part]] for side in (links.step, links.observer, links.neighbour))
         everyone, rows = fleet.position[step], np.arange(len(step))
         own, right = everyone[rows, observer], everyone[rows, neighbour]
-        away = np.linalg.norm(everyone - own[:, None], axis=-1)
-        gap = np.linalg.norm(everyone - right[:, None], axis=-1)
-        gap[~((away >= reach[0]) & (away <= reach[1]))] = np.inf  # of absent vehicles, too
-        gap[rows, neighbour] = gap[rows, observer] = np.inf
+        away = norm(everyone - own[:, None], axis=-1)
+        gap = norm(everyone - right[:, None], axis=-1)
+        gap[~((away >= reach[0]) & (away <= reach[1]))] = inf  # of absent vehicles, too
+        gap[rows, neighbour] = gap[rows, observer] = inf
         other = np.argmin(gap, axis=1)
         done[part] = np.isfinite(gap[rows, other])
         angles = (np.stack(spherical(*(to - own).T)[1:], axis=-1) for to in (everyone[rows, other], right))

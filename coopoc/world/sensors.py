@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.random import Generator, Philox, SeedSequence
 
 from ..arrays import TINY, Floats, Limits, check_fields, checked, extent, instance, listed, number, seed_of
 from ..errors import InputError, unknown
@@ -250,7 +251,7 @@ class Sensors:
 
     def velocity_std(self, velocity: Floats, floor: float = 0.0) -> Floats:
         """Noise std (..., 3) m/s at a velocity (..., 3) m/s, at least `floor` (default 0: what acts)."""
-        size: Floats = np.abs(np.atleast_1d(checked("velocity", velocity)))
+        size: Floats = abs(np.atleast_1d(checked("velocity", velocity)))
         if self.velocity_reading == "speed":
             size = np.broadcast_to(np.linalg.norm(size, axis=-1, keepdims=True), size.shape)
         std: Floats = np.maximum(self.velocity_std_ratio * size, number("floor", floor))
@@ -304,7 +305,7 @@ class Sensors:
         return cls(gnss_std=(3.5, 3.5, 3.5), velocity_std_ratio=velocity_std_ratio)
 
 
-def stream(seed: int, sensor: str, run: int, vehicle: str, partner: str = "") -> np.random.Generator:
+def stream(seed: int, sensor: str, run: int, vehicle: str, partner: str = "") -> Generator:
     """Random stream of one sensor of one vehicle in one run; step t takes the t-th draw.
 
     30 runs are a prefix of 100, and adding a vehicle, a neighbour or a method changes no other draws, because the key
@@ -324,5 +325,5 @@ def stream(seed: int, sensor: str, run: int, vehicle: str, partner: str = "") ->
         seed = seed_of(seed)
     key = (seed, run, *(zlib.crc32(word.encode()) for word in (sensor, vehicle, partner)))
     small = max(seed, run) < 2**32  # then NumPy makes the same words of the key, three times as slowly
-    entropy = np.array(key, dtype=np.uint32) if small else key
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy)))
+    entropy = np.array(key, np.uint32) if small else key
+    return Generator(Philox(SeedSequence(entropy)))

@@ -43,7 +43,7 @@ class Spoofing:
         [0.0, 0.0, 0.5, 1.0]
         """
         since = t - t[0] - self.start
-        return np.asarray(np.clip(since / self.ramp, 0.0, 1.0) if self.ramp else since >= -1e-9, dtype=float)
+        return np.asarray(np.clip(since / self.ramp, 0.0, 1.0) if self.ramp else since >= -1e-9, float)
 
     @property
     def note(self) -> str:

@@ -2,9 +2,9 @@
 
 import hashlib
 import json
-import math
 import zipfile
 from dataclasses import asdict
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -96,16 +96,12 @@ def _check_shapes(packed: zipfile.ZipFile) -> None:
             read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
             shape, _, dtype = read(file)
         name = part.filename.removesuffix(".npy")
-        if (
-            name in shapes
-            or name not in (FORMAT_NAME, *FIELD_NAMES)
-            or math.prod(shape) * dtype.itemsize > part.file_size
-        ):
+        if name in shapes or name not in (FORMAT_NAME, *FIELD_NAMES) or prod(shape) * dtype.itemsize > part.file_size:
             raise ValueError(f"an array {name[:60]} of shape {shape} and dtype {dtype}")
         shapes[name] = shape
     runs, steps, vehicles, _ = shapes["gnss"]
     most = 3 * runs * max(steps * vehicles, *shapes["links_step"])
-    if shapes["t"] != (steps,) or any(math.prod(shape) > most for shape in shapes.values()):
+    if shapes["t"] != (steps,) or any(prod(shape) > most for shape in shapes.values()):
         raise ValueError(f"arrays of shapes {shapes}")
 
 

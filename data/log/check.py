@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.linalg import norm
+from numpy import inf
+from numpy.linalg import lstsq, norm
 
 from coopoc.arrays import Floats
 from coopoc.methods.noise_model import NoiseModel
@@ -201,7 +202,7 @@ def _axes(c: Check, column: int) -> str:
     if not size or abs(np.vdot(driven, moved)) > LEAST_CORRELATION * size:
         return ""
     both = np.stack([driven, driven.conj()], axis=1)  # swapped degrees have other lengths; one axis, both
-    (turn, mirror), *_ = np.linalg.lstsq(both, moved)
+    (turn, mirror), *_ = lstsq(both, moved)
     if abs(mirror) > 2 * abs(turn) and norm(both @ [turn, mirror]) > LEAST_CORRELATION * length:
         return (
             f"axes look swapped or mirrored: fixes move as odometry mirrored at {np.angle(mirror, deg=True) / 2:.0f}"
@@ -238,7 +239,7 @@ def _of_rows(c: Check) -> Iterator[str]:
     summary = c.log.summary
     left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith(EXPECTED)}
     used = sum(number for why, number in left.items() if any(word in why for word in USED_COUNTS))
-    share = max(used / max(used + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or np.inf))
+    share = max(used / max(used + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or inf))
     held = left.get(HOLDS, 0) > LEAST_FIXES
     if share > UNUSED_SHARE or held:
         why = HOLDS if held else max(left, key=lambda reason: left[reason])
@@ -323,7 +324,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         say(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
     elif name in c.failing and all(MAY in one for one in sentences):
         moved, driven, *_ = moves(c, column)
-        back = np.abs(moved + driven) < 0.5 * np.abs(moved)
+        back = abs(moved + driven) < 0.5 * abs(moved)
         cause = "slips, or a speed or heading that is held or wrong."
         if back.sum() >= 3 and back.mean() > LEAST_BACK:
             cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
@@ -346,7 +347,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
             f"{name}: the bias of its yaw rates {may} {row['yaw_rate_bias']:.2g} +- "
             f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
         )
-    most = 2.0 if all(MAY in one for one in sentences) else np.inf
+    most = 2.0 if all(MAY in one for one in sentences) else inf
     if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= most:
         say(
             f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
@@ -419,8 +420,8 @@ def _of_fixes(c: Check) -> Iterator[str]:
         for share in ([1, 1, 1], [0, 0, 1])[shown:]:  # without an arm that is sure a clock may explain it all
             x, z = (each[:, finite, column].T * share for each in (made, then))
             factor, std = factors(off[finite, column], x, usual, every_one, z=z)
-            sure = np.abs(factor) > OFFSET_ERRORS * std
-            arm = (sure & (np.abs(factor) > LEAST_ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM
+            sure = abs(factor) > OFFSET_ERRORS * std
+            arm = (sure & (abs(factor) > LEAST_ARM))[:2].any() and abs(factor[:2]).max() < LONGEST_ARM
             if arm:
                 yield (
                     f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
@@ -480,10 +481,10 @@ def _unseen(c: Check) -> Iterator[str]:
     if c.log.recording.body is not None:
         turns = ("yaw_rate_bias", LEAST_DRIFT, "rad/s, of the yaw rates")
     for name, least, what in (("speed_excess", LEAST_SCALE, "as a share, of the speeds"), turns):
-        errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", np.inf) for row in c.vehicles}
+        errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", inf) for row in c.vehicles}
         if blind := _below(errors, 2 * least):
             yield f"errors, {what} of {blind}"
-    late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
+    late = {row["vehicle"]: row.get("late_s_error", inf) for row in c.vehicles}
     if blind := _below(
         {who: SURE_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
     ):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 import scipy  # as in `residuals`
+from numpy import inf, nan
 from numpy.linalg import inv, lstsq, norm
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
@@ -67,7 +68,7 @@ class Estimate(NamedTuple):
 
 def no_estimate(count: int) -> Estimate:
     """Of so many numbers, which nothing shows."""
-    return Estimate(np.zeros(count), np.full(count, np.inf))
+    return Estimate(np.zeros(count), np.full(count, inf))
 
 
 def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, z: AnyArray | None = None) -> Estimate:
@@ -95,18 +96,18 @@ def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, 
         for _ in range(3):
             sums = (z[used].T @ all_of[used, : k + 1]).real
             factor = lstsq(sums[:, 1:], sums[:, 0])[0]
-            gap = np.abs(y - x @ factor)
+            gap = abs(y - x @ factor)
             used = used & (gap <= OUTLYING * np.median(gap[used]))
         return factor
 
     every = np.arange(len(y))
     value = fitted(every >= 0)
-    before, left = (np.median(np.abs(gap)) for gap in (y, y - x @ value))
+    before, left = (np.median(abs(gap)) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
     count = min(DRIVE_PARTS, max(len(y) // 2, min(len(y), FEW_PARTS)))
     changes = value - np.stack([fitted(every * count // len(y) != part) for part in range(count)])
-    none.value[seen], none.error[seen] = value, np.where(np.any(x, axis=0), lasting(changes), np.inf)
+    none.value[seen], none.error[seen] = value, np.where(np.any(x, axis=0), lasting(changes), inf)
     return none
 
 
@@ -134,7 +135,7 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
     instruments, by a later velocity: the filter errs by the noise of those until then."""
     rec, truth = c.world, c.log.truth
     velocity = plane(rec.velocity[0] if truth is None else truth.velocity)
-    speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
+    speed = pd.DataFrame(abs(velocity)).where(lambda v: v > MOVING)
     course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
     ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > STEADY_SPEED_RATIO * speed.mean())
     made = np.stack([ahead, 1j * ahead, velocity])
@@ -217,11 +218,11 @@ def odometry(c: Check, column: int) -> Estimate:
             means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2)
             each = moves(c, column, max(means, 1))
         moved, driven, turns, bends, span = each
-        square = max(np.square(np.abs(driven)).sum(), 1e-12)
+        square = max(np.square(abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
         y = moved - driven
         if rec.ids[column] in c.log.summary.assumed.get(COURSE.format("{}", "fixes"), ()):
-            along = driven.conj() / np.abs(driven)  # across, a heading that is derived follows the fixes
+            along = driven.conj() / abs(driven)  # across, a heading that is derived follows the fixes
             y, causes, span = (y * along).real + 0j, (causes * along).real + 0j, 0.0 * span
         value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
         attenuation = (norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
@@ -232,28 +233,28 @@ def odometry(c: Check, column: int) -> Estimate:
         error[2] /= abs(turned.real)
         error[:2] = np.hypot(error[:2], attenuation) / abs(turned) ** 2
         if abs(value[2]) > max(5.0 * BEHIND, SURE_ERRORS * error[2]):  # smoothed fixes cut bends: all else seems wrong
-            error[[0, 1, 3, 4]] = np.inf
+            error[[0, 1, 3, 4]] = inf
         return Estimate(value, error)
     path = plane(truth.position[:, column])
-    true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
+    true = np.diff(path, prepend=nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]
     if body is not None:
         odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
         heading = None if truth.heading is None else truth.heading[:, column]
-        true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
+        true = (abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)])
     used = np.isfinite(odometer + x.sum(axis=0))
-    pace = np.maximum(np.abs(true), np.abs(odometer))
+    pace = np.maximum(abs(true), abs(odometer))
     used &= pace > min(MOVING, OF_FASTEST * np.nanmax(pace, initial=0.0))  # standing, nothing errs
     constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), norm(noise) / len(noise) ** 0.5
     value, error = _of_motion((odometer - true)[used], x[:, used], constant, usual)
     forward = 1 + value[0]
-    late = -value[2] / forward if abs(forward) > LEAST_FORWARD else np.inf
+    late = -value[2] / forward if abs(forward) > LEAST_FORWARD else inf
     value[:3] = *_polar(1 + complex(*value[:2])), late
     sure = abs(late) < LONG_LAG  # what is linear in a lag holds for small ones
-    error[2] = error[2] / abs(forward) if sure else np.inf
+    error[2] = error[2] / abs(forward) if sure else inf
     if body is not None:
-        error[1] = np.inf
+        error[1] = inf
         if truth.heading is not None:
             gap = body.yaw_rate[0, 1:, column] - wrap(np.diff(truth.heading[:, column])) / rec.dt
             value[1], error[1] = median(gap[np.isfinite(gap)])
@@ -326,7 +327,7 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     error[size:] = np.hypot(error[size:], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
     error[measured[measured == reference]] = 0.0
     if reference is None and len(measured):
-        apart = np.abs(np.subtract.outer(value[measured], value[measured]))
+        apart = abs(np.subtract.outer(value[measured], value[measured]))
         return clocks(c, alike, measured[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))])
     return Estimate(value, ERRORS_LAST * error), made, which
 
@@ -342,14 +343,14 @@ def share(c: Check) -> float:
 def median(values: Floats) -> tuple[float, float]:
     """Median, and its standard error by the medians of parts of the drive; infinite of too few."""
     if len(values) < LEAST_COUNT:
-        return 0.0, np.inf
+        return 0.0, inf
     parts = np.array([np.median(part) for part in np.array_split(values, min(DRIVE_PARTS, len(values) // 2))])
     return float(np.median(values)), float(lasting(parts[:, None])[0] / len(parts))
 
 
 def pairs(c: Check, k: int, directed: bool) -> "pd.Series[str]":
     """Who measured whom, or between which two if not `directed`: of the links that have a residual of one kind."""
-    links, ids = c.world.links, np.array(c.world.ids, dtype=object)
+    links, ids = c.world.links, np.array(c.world.ids, object)
     there = np.flatnonzero(np.isfinite(c.relative[:, k]))
     ends = np.column_stack([links.observer, links.neighbour])[there]
     one, other = ids[ends if directed else np.sort(ends)].T
@@ -367,14 +368,14 @@ def lag_of_fixes(c: Check, column: int) -> float:
     path = path if truth is None else plane(truth.position[:, column])
     there = np.isfinite(fixes)
     lags = np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
-    places = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, np.nan, np.nan) for lag in [0.0, *lags])]
+    places = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, nan, nan) for lag in [0.0, *lags])]
     moved = np.stack(places)[:, LEAST_COUNT:] - np.stack(places)[:, :-LEAST_COUNT]
-    off = np.abs(moved[0] - moved[1:])
-    misses = np.where(np.isfinite(off).sum(axis=1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), np.inf)
+    off = abs(moved[0] - moved[1:])
+    misses = np.where(np.isfinite(off).sum(axis=1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), inf)
     now, least, misses = misses[0], misses.min(), misses[1:]
     if least > min(OUTLYING * c.fix_noise, now / 2):
         return 0.0
-    near = np.abs(lags - min(lags[misses < 1.2 * least], key=abs)) < LONG_LAG
+    near = abs(lags - min(lags[misses < 1.2 * least], key=abs)) < LONG_LAG
     return float(lags[near][misses[near].argmin()])
 
 
@@ -398,18 +399,18 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
     on_time = ~np.isin(rec.ids, late)
-    x = np.where(marks[:, None], c.x, np.where((fits & on_time)[:, None], truth.position, np.nan))
+    x = np.where(marks[:, None], c.x, np.where((fits & on_time)[:, None], truth.position, nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
     if c.log.recording.body is None:
         stated[1] = noise.world_azimuth_std
     else:
         turned = rec.relative[0, :, 1] - c.log.recording.relative[0, :, 1]
-        known = np.full(rec.gnss[0, ..., 0].shape, np.nan) if truth.heading is None else truth.heading
+        known = np.full(rec.gnss[0, ..., 0].shape, nan) if truth.heading is None else truth.heading
         residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
     used = np.isfinite(residual)
     relative = np.where(used, residual, c.relative)
     fit = (fits | marks | ~on_time)[[rec.links.observer, rec.links.neighbour]].all(axis=0)
-    relative[~fit] = np.nan  # of others nothing is known
+    relative[~fit] = nan  # of others nothing is known
     x = np.where(np.isfinite(x), x, c.x)
     return replace(c, x=x, relative=relative, expected=np.where(used, stated, c.expected))
 
@@ -421,12 +422,12 @@ def on_time(c: Check, alike: bool, true: Check) -> Check:
     size = len(c.world.ids)
     if alike and c.log.truth is not None:
         value[size:], error[size:] = (part[size:] for part in clocks(true, True)[0])
-    maybe = np.abs(value) > 2.0 * error
+    maybe = abs(value) > 2.0 * error
     if alike and not (maybe[size:].any() and abs(value[size]) < UNITS_APART):  # clocks look like it, or undo it
         return on_time(c, False, true)
     least = np.where(np.arange(size + 2) == size, LEAST_SCALE, LEAST_LAG)
-    error[:size][np.abs(value[:size]) > LONG_LAG] = np.inf  # what is linear in a lag holds for small ones
-    off = np.where(np.abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
+    error[:size][abs(value[:size]) > LONG_LAG] = inf  # what is linear in a lag holds for small ones
+    off = np.where(abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ off[which])
     ranges = tuple(zip(off[size:], error[size:], strict=True))

@@ -50,7 +50,7 @@ HEADING_STD = 0.05
 def check_origin(origin: Origin) -> None:
     """InputError unless it is latitude and longitude in degrees, and height in m."""
     values, allowed = checked("origin", origin, "(3,)", (3,)), "must be degrees of latitude and longitude, and m"
-    refuse("origin", values, ~(np.abs(values) <= [90.0, 180.0, 1e6]), allowed, "Give origin=(48.14, 11.58, 520.0).")
+    refuse("origin", values, ~(abs(values) <= [90.0, 180.0, 1e6]), allowed, "Give origin=(48.14, 11.58, 520.0).")
 
 
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
@@ -293,7 +293,7 @@ def fix_factors(rows: Rows, ids: Sequence[str], steps: "Steps") -> Floats:
     square, step = np.square(fixes["std"]), steps.nearest(fixes["t"].to_numpy())[0]
     each = (square / square.mean()).groupby([step, fixes["vehicle"]]).mean().unstack()
     factor = np.sqrt(each.reindex(range(len(steps.grid)), columns=ids).ffill().bfill().fillna(1.0).to_numpy())
-    return factor if (np.abs(np.log(factor)) > EQUAL_LOG_FACTOR).any() else np.empty(0)
+    return factor if (abs(np.log(factor)) > EQUAL_LOG_FACTOR).any() else np.empty(0)
 
 
 def _apart(rows: Rows, kinds: Sequence[str], dt: float) -> float:

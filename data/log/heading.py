@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy import nan, pi
 
 from coopoc import PoseFilter, Sensors
 from coopoc.arrays import Floats
@@ -22,7 +23,7 @@ SURE = 0.15
 """rad, standard deviation of a heading below which it is one."""
 GYRO_BIAS, GYRO_WALK, SCALE = 0.02, 0.01, 0.03
 """rad/s, bias of a yaw rate; rad in a root of a second, by which its integral wanders; share by which a speed errs."""
-OTHERWISE, FITS_BETTER = (1.0, -1.0, np.pi / 180), 0.5
+OTHERWISE, FITS_BETTER = (1.0, -1.0, pi / 180), 0.5
 """Factors of yaw rates that may have been meant: none, clockwise, degrees; share of the squared innovations of the
 first that another leaves."""
 
@@ -38,7 +39,7 @@ class Signal(NamedTuple):
 
 def unknown(at: Floats) -> Floats:
     """(G,) headings of what has none: NaN."""
-    return np.full(len(at), np.nan)
+    return np.full(len(at), nan)
 
 
 class Course(NamedTuple):
@@ -110,7 +111,7 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
 
     def at(times: Floats) -> Floats:
         angle = wrap(np.interp(times, heading.t, offset) + _angle(yaw_rate, times))
-        return np.where(covered(sampled, times, gap, gap / 2), angle, np.nan)
+        return np.where(covered(sampled, times, gap, gap / 2), angle, nan)
 
     return at
 
@@ -154,7 +155,7 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
     last = heading_until(Signal(t, heading[:, None]), rate)
 
     def at(times: Floats) -> Floats:
-        return np.where(covered(rate.t, times, gap, gap / 2), last(times), np.nan)
+        return np.where(covered(rate.t, times, gap, gap / 2), last(times), nan)
 
     noise, square = way.std**2 * float(np.median(np.diff(way.fixes.t))), Signal(t, variance[:, None])
 
@@ -183,15 +184,15 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     moves, turn = step_means(speed, t)[:, None, :2], step_means(rate, t)
     rec = planar_recording(("vehicle",), t, moves, turn, np.empty((0, 2)), np.empty((0, 5)), sensors, "")
     step = steps_of(fixes.t - t[0], dt, len(t))
-    gnss = np.full_like(rec.gnss, np.nan)
+    gnss = np.full_like(rec.gnss, nan)
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
     runs = np.arange(len(OTHERWISE) * FIRST_DIRECTIONS)
     rec = replace(rec, gnss=gnss).of_runs(0 * runs)
     assert rec.body is not None
     meant = np.repeat(OTHERWISE, FIRST_DIRECTIONS)[:, None, None]
     rec = replace(rec, body=replace(rec.body, yaw_rate=meant * rec.body.yaw_rate))
-    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs % FIRST_DIRECTIONS, [0, 0, 0, 2 * np.pi / FIRST_DIRECTIONS])
-    spread = std, std, PLANE_STD, np.pi / FIRST_DIRECTIONS
+    begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs % FIRST_DIRECTIONS, [0, 0, 0, 2 * pi / FIRST_DIRECTIONS])
+    spread = std, std, PLANE_STD, pi / FIRST_DIRECTIONS
     track = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
     assert track.covariance is not None
     assert track.heading is not None
@@ -201,7 +202,7 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     best = sums[:FIRST_DIRECTIONS].argmin(axis=0), np.arange(len(t))
     heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
     known = np.maximum.accumulate(variance < SURE**2)
-    return t, np.where(known, heading, np.nan), variance, sums[:, -1].reshape(len(OTHERWISE), -1).min(axis=1)
+    return t, np.where(known, heading, nan), variance, sums[:, -1].reshape(len(OTHERWISE), -1).min(axis=1)
 
 
 def held(signal: Signal, at: Floats) -> Floats:
@@ -211,7 +212,7 @@ def held(signal: Signal, at: Floats) -> Floats:
     [nan, 5.0, 5.0, 6.0]
     """
     last = np.searchsorted(signal.t, at + SAME_INSTANT, side="right") - 1
-    return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], np.nan)
+    return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], nan)
 
 
 def between(signal: Signal, at: Floats) -> Floats:

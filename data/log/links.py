@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+from numpy.linalg import norm
+from pandas import DataFrame
 
 from coopoc import V2X, Links, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, last_true, runs_in_memory
@@ -90,7 +92,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     links, marks = recording.links, list(recording.landmarks)
     marked = np.isin(links.neighbour, marks)
     near = np.flatnonzero(~(recording.relative[0, :, 0] > v2x.radius) & ~marked)
-    rank = pd.DataFrame({"step": links.step[near], "observer": links.observer[near]}).groupby(["step", "observer"])
+    rank = DataFrame({"step": links.step[near], "observer": links.observer[near]}).groupby(["step", "observer"])
     near = near[rank.cumcount() < v2x.max_neighbours]
     kept = np.union1d(near, np.flatnonzero(marked))
     recording = replace(with_links(recording, kept), v2x=v2x)
@@ -98,7 +100,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
         return recording
     if v2x.loss > 0 and recording.runs == 1:
         runs = runs_in_memory(runs, 8 * recording.broadcasts.size + 4 * len(kept))
-        recording = recording.of_runs(np.zeros(runs, dtype=np.int64))
+        recording = recording.of_runs(np.zeros(runs, int))
     broadcasts, arrival = schedule(recording.ids, recording.t, recording.links, v2x, recording.runs, seed)
     broadcasts = broadcasts & recording.present
     broadcasts[..., marks] = False
@@ -128,7 +130,7 @@ def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:
     return pd.Index(list(ids)).get_indexer(pd.Index(names))
 
 
-def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:
+def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> DataFrame:
     """One of each step, observer, neighbour (columns of members) and component of a link, with its value: range m,
     azimuth (in body frames bearing) rad or inclination rad."""
     std, rows = stated_std(rows, "x", "y"), rows[in_group(rows, "relative")]
@@ -153,7 +155,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     ):
         summary.refuse(reason, rows[wrong])
     numbers = {"step": step, "lag": lag, "observer": observer, "neighbour": neighbour, "value": value}
-    table = rows.assign(**numbers, component=rows["kind"].map(COMPONENTS).astype(np.int64))[good]
+    table = rows.assign(**numbers, component=rows["kind"].map(COMPONENTS).astype(int))[good]
     table = table.sort_values("lag", key=np.abs, kind="stable")
     again = table.duplicated([*LINK_COLUMNS, "component"])
     reason = "relative measurements beside a nearer one of the same pair, kind and step"
@@ -163,13 +165,13 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     moved, vague, full = _to_step(table, members, steps, NEAR_STDS * (std if std > 0.0 else Sensors().gnss_std[0]))
     summary.refuse("relative measurements between steps, of partners too near to move them to one", table[vague])
     summary.refuse("relative measurements at their maximum, of partners farther away", table[full])
-    kept: pd.DataFrame = table.assign(value=moved).loc[~vague & ~full, [*LINK_COLUMNS, "component", "value"]]
+    kept: DataFrame = table.assign(value=moved).loc[~vague & ~full, [*LINK_COLUMNS, "component", "value"]]
     for word, number in zip(words, np.bincount(kept["component"], minlength=3).tolist(), strict=True):
         summary.count(word, number)
     return kept
 
 
-def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[pd.DataFrame, Bools]:
+def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[DataFrame, Bools]:
     """Step of arrival, or -1, of each step, observer and neighbour with a message, and (T, N) who sends when."""
     sender, receiver = (_columns(rows[who], ids) for who in ("vehicle", "partner"))
     (step, _), summary, to_all = steps.nearest(rows["t"].to_numpy()), steps.summary, rows["partner"].eq("").to_numpy()
@@ -177,14 +179,14 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     absent = sent & ~to_all & ~((receiver >= 0) & there[step, receiver])
     summary.refuse("messages of a sender that is absent or has no position", rows[~sent])
     summary.refuse("messages to a receiver that is absent or has no position", rows[absent])
-    broadcasts = np.zeros(there.shape, dtype=bool)
+    broadcasts = np.zeros(there.shape, bool)
     broadcasts[step[sent], sender[sent]] = True
     columns = np.arange(len(ids))
     meant = np.where(to_all[:, None], sender[:, None] != columns, receiver[:, None] == columns)
     k, j = np.nonzero(meant & there[step] & sent[:, None])
     late = (rows["arrival"] - rows["t"]).to_numpy()
     arrival = step[k] + np.maximum(np.ceil((late[k] - 2e-6) / steps.dt), 0.0)
-    table = pd.DataFrame({"step": step[k], "observer": j, "neighbour": sender[k], "arrival": arrival})
+    table = DataFrame({"step": step[k], "observer": j, "neighbour": sender[k], "arrival": arrival})
     summary.refuse(
         "messages beside another of the same pair and step", rows.iloc[k[table.duplicated(LINK_COLUMNS).to_numpy()]]
     )
@@ -193,9 +195,7 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     return table.groupby(LINK_COLUMNS)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
-def _to_step(
-    table: pd.DataFrame, members: Mapping[str, Member], steps: Steps, std: float
-) -> tuple[Floats, Bools, Bools]:
+def _to_step(table: DataFrame, members: Mapping[str, Member], steps: Steps, std: float) -> tuple[Floats, Bools, Bools]:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
     their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_MOTIONS times
@@ -224,15 +224,15 @@ def _to_step(
         far, aside = (table["value"].where(component == k).groupby(at_once).transform("first") for k in (0, 1))
         seen = np.array(far * np.exp(1j * aside))
         there = seen + lag * (during(stacked(members, "velocity"), observer)[:, :2] @ [1, 1j])
-        less = np.column_stack([np.abs(there) - np.abs(seen), np.angle(there * seen.conj()), 0.0 * lag])
+        less = np.column_stack([abs(there) - abs(seen), np.angle(there * seen.conj()), 0.0 * lag])
         stands = np.array([member.stands for member in members.values()])[neighbour] & np.isnan(change[:, 0])
         change = np.where(stands[:, None], less, change)
         value = np.where(component == 1, value + lag * during(rate, observer), value)
     distance = np.where(component == 0, value, np.inf)
-    away = np.linalg.norm(now, axis=1)
+    away = norm(now, axis=1)
     full = (component == 0) & (value == value[component == 0].max(initial=0.0))
     full &= full.any() and np.median(np.nan_to_num(away - value)[full]) > std
-    gap, moved = np.minimum(away, distance), np.linalg.norm(now - then, axis=1)
+    gap, moved = np.minimum(away, distance), norm(now - then, axis=1)
     vague = (gap <= NEAR_MOTIONS * moved) & (gap <= std)
     value = value + np.where(vague, 0.0, np.nan_to_num(change[np.arange(len(change)), component]))
     return np.where(component == 1, wrap(value), value), vague, full

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy import inf, nan
 from numpy.linalg import norm
 
 from coopoc import InputError, Sensors
@@ -180,10 +181,10 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     measured, turn, speed = (samples(rows, kinds, summary) for kinds in (("heading",), ("yaw_rate",), BODY))
     speed = Signal(speed.t, np.nan_to_num(speed.value))
     still = np.zeros((len(grid), 3))
-    none = np.full(len(grid), np.nan)
+    none = np.full(len(grid), nan)
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
-        heading = Course(unknown if body else heading_at(measured, None, np.inf))
+        heading = Course(unknown if body else heading_at(measured, None, inf))
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still, still[:, 0])
     std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
@@ -193,7 +194,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     shown, (derived, factor) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
-        world, ever = samples(rows, VELOCITIES[:2], Summary(), 2), steps._replace(max_gap=np.inf)
+        world, ever = samples(rows, VELOCITIES[:2], Summary(), 2), steps._replace(max_gap=inf)
         pointing = _heading(measured, world, shown, derived, way, ever)
         if pointing.at is unknown or not np.isfinite(off).all():
             raise InputError(
@@ -221,7 +222,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
                     'Log both, or pass frame="world".',
                 )
         summary.refuse("world velocities in body frames", only(rows, *VELOCITIES))
-        signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
+        signals, heading = [speed, turn], Course(heading_at(measured, turn, inf))
         along = _heading(measured, None, shown, derived, way, steps)
         velocity, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         moves: Floats = turned(velocity, along.at(grid))
@@ -247,7 +248,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time{_longest(there, grid)}"
     text = f"{len(fixes.t)} fixes, {len(signals[0].t) * (not by_fixes)} samples of odometry, "
     text += f"{len(measured.t)} headings, {span}"
-    absent, compass = np.where(there, 0.0, np.nan), none
+    absent, compass = np.where(there, 0.0, nan), none
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
@@ -275,7 +276,7 @@ def climbing(fixes: Signal) -> float:
         now = np.flatnonzero(later < len(t))
         if len(now) < 3:
             break
-        near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
+        near, far = (float(np.quantile(abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
         near *= 1.0 + 2.0 / len(now) ** 0.5
         wander = max(far - near, 0.0) / float(np.mean(t[later[now]] - t[now]))
         if far > 2.0 * near:
@@ -346,7 +347,7 @@ def _heading(
         sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
-        fastest = np.abs(way.speed.value).max() if len(way.speed.t) else np.inf
+        fastest = abs(way.speed.value).max() if len(way.speed.t) else inf
         least = min(MOVING, OF_FASTEST * fastest)
         if (moving := (pace > np.maximum(least, SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
@@ -416,13 +417,13 @@ def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, 
     """Index of the sample nearest in time to each step that has one while the member is there, these steps, and how
     much later the samples are, s."""
     step, lag = steps.nearest(signal.t)
-    kept = nearest(np.abs(lag), np.where(there[step], step, -1), step)
+    kept = nearest(abs(lag), np.where(there[step], step, -1), step)
     return kept, step[kept], lag[kept]
 
 
 def _present(signals: Sequence[Signal], steps: Steps) -> Bools:
     """(T,) whether all signals are there, or bridged."""
-    there = np.ones(len(steps.grid), dtype=bool)
+    there = np.ones(len(steps.grid), bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
         there &= covered(signal.t, steps.grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
@@ -440,7 +441,7 @@ def _held(fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bo
 
 def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps) -> Floats:
     """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
-    gnss, summary, rows = np.full((len(steps.grid), 3), np.nan), steps.summary, only(rows, "x")
+    gnss, summary, rows = np.full((len(steps.grid), 3), nan), steps.summary, only(rows, "x")
     nearest, _ = steps.nearest(fixes.t)
     kept, step, lag = _nearest_of_each(fixes, there, steps)
     absent = ~there[nearest]

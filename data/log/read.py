@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from numpy import nan
 from scipy.interpolate import Akima1DInterpolator
 
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
@@ -469,7 +470,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
     heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")
     if axes == 2 and heights.abs().gt(0.0).to_numpy().any():
         summary.assume("the truth has no heights: 20 s means of the fixes' heights replace them, and hide their errors")
-    poses = np.full((len(steps), len(ids), 4), np.nan)
+    poses = np.full((len(steps), len(ids), 4), nan)
     for column, vehicle in enumerate(ids):
         own_rows = rows[rows["vehicle"] == vehicle]
         true, heading = samples(own_rows, ("x", "y", "z"), Summary(), axes), samples(own_rows, ("heading",), Summary())
@@ -483,7 +484,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
                         f"a low-rate truth counts within {SPARSE_SECONDS:g} s of its samples, by Akima's interpolation"
                     )
                     near = covered(t, steps, 0.0, SPARSE_SECONDS)[:, None] & np.isfinite(out)
-                    out[:] = np.where(near, Akima1DInterpolator(t - steps[0], value)(steps - steps[0]), np.nan)
+                    out[:] = np.where(near, Akima1DInterpolator(t - steps[0], value)(steps - steps[0]), nan)
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
@@ -497,7 +498,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
     if axes == 2:
         position[..., 2] = heights.fillna(0.0).where(np.isfinite(position[..., 0]))
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
-    position[~(there[2:] | there[:-2])] = np.nan
+    position[~(there[2:] | there[:-2])] = nan
     velocity = backward_difference(steps, position, ids)
     turned = wrap(angle) if np.isfinite(angle).any() else None
     return Fleet(ids, steps, position, velocity, name=name, source=f"truth of {name}", heading=turned)

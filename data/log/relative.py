@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy import inf, nan
+from numpy.linalg import norm
 
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.world.links import wrap
@@ -79,7 +81,7 @@ def measurements(c: Check) -> list[dict[str, Any]]:
                 "stated_std": stated,
                 "expected_std": float(np.sqrt(np.mean(expected**2))),
                 "noise": noise,
-                "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * least)),
+                "beyond_5_std": float(np.mean(abs(off) > OUTLYING * least)),
             }
         )
     return rows
@@ -89,7 +91,7 @@ def of_places(c: Check) -> Iterator[str]:
     """Members that stand elsewhere than their fix says."""
     ids, at = c.world.ids, plane(np.nan_to_num(c.x)[-1])
     for name, (away, error) in c.places.items():
-        off = np.abs(at[ids.index(name)] + away - at)
+        off = abs(at[ids.index(name)] + away - at)
         like = f": there is {ids[off.argmin()]}. Are names exchanged?"
         yield (
             f"{name}: it stands {away.real:+.2f} m east and {away.imag:+.2f} m north of its fix, +- {error:.2f} m, by "
@@ -133,8 +135,8 @@ def _elsewhere(c: Check, column: int) -> tuple[complex, float]:
     of_it = (links.observer == column) | (links.neighbour == column)
     there = np.isfinite(c.relative[:, :2]) & of_it[:, None]
     group = (2 * (links.observer + links.neighbour)[:, None] + [0, 1])[there]
-    if len(group) < LEAST_COUNT or np.median(np.abs((c.relative / c.expected)[:, :2][there])) <= 1.0:
-        return 0j, np.inf
+    if len(group) < LEAST_COUNT or np.median(abs((c.relative / c.expected)[:, :2][there])) <= 1.0:
+        return 0j, inf
     computed = residual_of(c.world, c.x)[1]
 
     def misses(away: complex) -> Floats:
@@ -145,12 +147,12 @@ def _elsewhere(c: Check, column: int) -> tuple[complex, float]:
         miss[:, 1] = wrap(miss[:, 1])
         return np.asarray((miss / c.expected)[:, :2][there])
 
-    away, error = 0j, np.inf
+    away, error = 0j, inf
     for _ in range(GAUSS_NEWTON):
         y = misses(away)
         x = np.column_stack([y - misses(away + step) for step in (NUDGE_STEP, NUDGE_STEP * 1j)]) / NUDGE_STEP
         value, unsure = factors(y, x, 1.0, group)
-        away, error = away + complex(*value), float(np.linalg.norm(unsure))
+        away, error = away + complex(*value), float(norm(unsure))
     known = np.nan_to_num(c.expected[of_it, 0] ** 2 - c.world.sensors.range_std**2).clip(1e-12)
     return away, float(np.hypot(error, (known.mean() * share(c) / len(np.unique(group // 2))) ** 0.5))
 
@@ -179,7 +181,7 @@ def of_measurements(c: Check) -> Iterator[str]:
             wrong |= (other := not 0.8 <= ratio <= 1.25)
             varied = robust_std(true[far]) > 0.2 * np.median(true[far]) if len(ratios) else False
             powers = np.log10([ratio, 0.3048 * ratio])
-            usual = np.abs(powers - np.round(powers)).min() < 0.02
+            usual = abs(powers - np.round(powers)).min() < 0.02
             if scaled := other and (varied or usual) and robust_std(ratios) < 0.2 * ratio:
                 power = round(np.log10(ratio))
                 unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
@@ -253,20 +255,20 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
         lasts = LASTS_STDS * c.fix_noise / (np.maximum(measured[rows], 1.0) if k else 1.0)
-        errors = pd.Series(np.abs(wrap(less) if k else less) / np.maximum(expected, lasts))
+        errors = pd.Series(abs(wrap(less) if k else less) / np.maximum(expected, lasts))
         bad = np.flatnonzero(errors.rolling(MEDIAN_WINDOW, 1, center=True).median() > OUTLYING)  # most are too large
         if len(bad) < LEAST_COUNT:
             continue
-        size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
+        size, text = float(np.median(abs(off[bad]))), when(t[links.step[rows]], bad)
         some = rows[bad[:: len(bad) // MISFITS + 1]]
         steps, lags = links.step[some][:, None], np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
         then = (steps - np.round(lags / world.dt).astype(int)).clip(0, len(c.x) - 1)
         places = np.concatenate([c.x[steps[:, 0]], c.x[then, other]], axis=1)  # of all, and of its own before and later
-        far = np.linalg.norm(places - c.x[steps, one], axis=2)
-        miss = pd.DataFrame(np.abs(far - measured[some, None])).median().fillna(np.inf)
-        best, ahead = int(miss.argmin()), np.nan
+        far = norm(places - c.x[steps, one], axis=2)
+        miss = pd.DataFrame(abs(far - measured[some, None])).median().fillna(inf)
+        best, ahead = int(miss.argmin()), nan
         if k == 0 and miss[best] < WIDE_RATIO * np.median(expected) < 0.2 * size:
-            ahead = np.nan if best < len(ids) else float(lags[best - len(ids)])
+            ahead = nan if best < len(ids) else float(lags[best - len(ids)])
             text += f", as if {f'to {ids[best]}' if best < len(ids) else f'its clock was {ahead:+.1f} s ahead'}"
         misfit_of[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}", ahead
     return misfit_of
@@ -291,7 +293,7 @@ def _other_angle(c: Check) -> str:
     """What azimuths look like that miss the positions by the course of their observers."""
     links = c.world.links
     moves = plane(c.world.velocity[0, links.step, links.observer])
-    there, heading = np.isfinite(c.relative[:, 1]), np.where(np.abs(moves) > MOVING, np.angle(moves), np.nan)
+    there, heading = np.isfinite(c.relative[:, 1]), np.where(abs(moves) > MOVING, np.angle(moves), nan)
     residual, course, measured = c.relative[there, 1], heading[there], c.world.relative[0, there, 1]
     off = np.angle(np.exp(1j * residual).sum())
     off += np.median(wrap(residual - off))
@@ -303,9 +305,9 @@ def _other_angle(c: Check) -> str:
         "azimuths clockwise: change their sign": -2 * measured,
         f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}": -off,
     }
-    rests = {like: np.abs(wrap(residual + turn)) for like, turn in causes.items()}
+    rests = {like: abs(wrap(residual + turn)) for like, turn in causes.items()}
     left = {like: np.nanmedian(rest) for like, rest in rests.items() if np.isfinite(rest).sum() >= LEAST_COUNT}
-    if 3 * (least := min(left.values(), default=np.inf)) > np.median(np.abs(residual)):
+    if 3 * (least := min(left.values(), default=inf)) > np.median(abs(residual)):
         return ""
     return f"They look like {next(like for like, rest in left.items() if rest <= 1.5 * least)}."
 

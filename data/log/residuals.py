@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import scipy  # its statistics take half a second, and are imported where they are used
+from numpy import inf, nan
 
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
@@ -142,7 +143,7 @@ def without_wild(c: Check) -> Check:
     """The same, less the fixes that are wild, of vehicles whose odometry does not fail."""
     size, rec = dimensions(c.world), c.log.recording
     square = pd.DataFrame(size * c.normalised)
-    square[[*map(rec.ids.index, c.failing)]] = np.nan
+    square[[*map(rec.ids.index, c.failing)]] = nan
     usual = (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS)
     wild = np.array(square > WILD_STDS**2 * usual)
     for column in range(wild.shape[1]):  # where the next fix is off alike, the filter is
@@ -151,7 +152,7 @@ def without_wild(c: Check) -> Check:
         wild[at[:-1], column] &= ~(off[1:] & ((gap[:-1] * gap[1:].conj()).real > 0))
     if rec.body is not None or not wild.any():
         return c
-    less = replace(rec, gnss=np.where(wild[..., None], np.nan, rec.gnss))
+    less = replace(rec, gnss=np.where(wild[..., None], nan, rec.gnss))
     return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(axis=0), failing=c.failing)
 
 
@@ -163,9 +164,9 @@ def filtered(log: Log) -> Check:
         log, span = together(log)
     rec = log.recording.of_runs(slice(0, 1))
     steps, vehicles, links = len(rec.t), len(rec.ids), rec.links
-    x, variance, fix = (np.full((steps, vehicles, 3), np.nan) for _ in range(3))
-    normalised, heading, heading_variance = np.full((steps, vehicles), np.nan), *np.zeros((2, steps, vehicles))
-    marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), np.inf)
+    x, variance, fix = (np.full((steps, vehicles, 3), nan) for _ in range(3))
+    normalised, heading, heading_variance = np.full((steps, vehicles), nan), *np.zeros((2, steps, vehicles))
+    marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), inf)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
     if rec.body is None:
         followed = [column for column in range(vehicles) if rec.stretches(column)]
@@ -197,14 +198,14 @@ def filtered(log: Log) -> Check:
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting, np.zeros(vehicles)
-    return Check(log, span + start, world, track, *stats, np.full(vehicles, np.inf), np.zeros(vehicles, dtype=np.int64))
+    return Check(log, span + start, world, track, *stats, np.full(vehicles, inf), np.zeros(vehicles, int))
 
 
 def without(c: Check, columns: Sequence[int]) -> Check:
     """The same without relative measurements of these vehicles."""
     links = c.world.links
     ends = np.isin(links.observer, columns) | np.isin(links.neighbour, columns)
-    return replace(c, relative=np.where(ends[:, None], np.nan, c.relative))
+    return replace(c, relative=np.where(ends[:, None], nan, c.relative))
 
 
 def plane(vectors: Floats) -> AnyArray:
@@ -229,5 +230,5 @@ def residual_of(world: Recording, x: Floats, reversed_pairs: Sequence[int] = ())
     gap = x[links.step, links.neighbour] - x[links.step, links.observer]
     residual = world.relative[0] - np.column_stack(spherical(*gap.T))
     residual[:, 1:] = wrap(residual[:, 1:])
-    residual[np.isin(links.observer * len(world.ids) + links.neighbour, reversed_pairs)] = np.nan
+    residual[np.isin(links.observer * len(world.ids) + links.neighbour, reversed_pairs)] = nan
     return gap, residual

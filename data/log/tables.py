@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from pandas import DataFrame
 
 from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError, suggestion
@@ -77,7 +78,7 @@ def read_log_table(
     return rows
 
 
-def _with_whole_stamps(frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
+def _with_whole_stamps(frame: DataFrame, columns: Mapping[str, str]) -> DataFrame:
     """The frame with stamps of whole seconds and nanoseconds beside them, as of ROS, in one column: t, if none is."""
     numbers = frame.select_dtypes("number")
     for name in numbers:
@@ -88,9 +89,7 @@ def _with_whole_stamps(frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.Da
     return frame
 
 
-def _long(
-    frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
-) -> pd.DataFrame:
+def _long(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> DataFrame:
     frame = frame.assign(kind=words(frame, "kind", file))
     left = frame["kind"].isin(ignore)
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
@@ -110,9 +109,7 @@ def _long(
     return _cells(frame, file, "value", "std")
 
 
-def _wide(
-    frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
-) -> pd.DataFrame:
+def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> DataFrame:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     columns: dict[str, tuple[str, dict[str, str]]]
     columns = {"arrival" if kind == "message" else kind: (kind, {}) for kind in KINDS}
@@ -151,7 +148,7 @@ def _of_partner(column: str) -> tuple[str, str] | None:
     return None if is_column else (kind, partner)
 
 
-def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame:
+def _cells(frame: DataFrame, file: str, value: str, std: str) -> DataFrame:
     """Times, names and numbers of a table with a column kind; `value` and `std` are the columns of these."""
     message = (frame["kind"] == "message").to_numpy()
     for mask, column in ((~message, value), (message, "arrival")):
@@ -160,7 +157,7 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
 
     def read(reader: Callable[..., Any], column: str, there: Bools, blank: Any = np.nan) -> AnyArray:
         """What a column holds in the rows that have it."""
-        cells = np.full(len(frame), blank, dtype=object if blank == "" else float)
+        cells = np.full(len(frame), blank, object if blank == "" else float)
         if there.any():
             cells[there] = reader(frame[there], column, file)
         return cells

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy import pi
 
 from coopoc import InputError
 from coopoc.arrays import Bools
 
-DEGREE, MAX_ANGLE_RAD = float(np.pi / 180), float(2 * np.pi) + 1e-3
+DEGREE, MAX_ANGLE_RAD = float(pi / 180), float(2 * pi) + 1e-3
 
 
 BODY, QUATERNION = ["speed", "vy_body", "vz_body"], ["qx", "qy", "qz", "qw"]
@@ -51,14 +52,14 @@ KINDS = {
     "azimuth": Kind("relative", "azimuth", MAX_ANGLE_RAD),
     "bearing": Kind("relative", "bearing", MAX_ANGLE_RAD),
     "inclination": Kind("relative", "inclination", MAX_ANGLE_RAD / 2),
-    "elevation": Kind("relative", "inclination", MAX_ANGLE_RAD / 4, -1.0, float(np.pi / 2)),
+    "elevation": Kind("relative", "inclination", MAX_ANGLE_RAD / 4, -1.0, float(pi / 2)),
     "message": Kind("message", "message"),
 }
 """Azimuth and heading are anticlockwise from +x (east), compass_deg clockwise from north, bearing anticlockwise from
 the observer's heading, inclination from +z, elevation above the horizon. A unit that is not SI is in the name."""
 for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "elevation"):
     KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
-KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
+KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(pi / 2))
 KIND_LIMITS = {name: kind.limit for name, kind in KINDS.items()}
 LEAST_VALUES = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 MOST_CODES, LEAP_RATIO, LEAST_MEANT = 3, 1.4, 10

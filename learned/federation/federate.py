@@ -1,9 +1,9 @@
 """Federated training: some rounds of local training on the clients that are asked, and of aggregation at a server."""
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import nan
 from typing import NamedTuple
 
 import torch
@@ -153,7 +153,7 @@ def federate(
         return tuple(judge(theta.repeat(len(names), 1)).tolist())
 
     standing = Standing(flatten([start])[0])
-    history = [Round(0, standing.theta, (math.nan,) * len(names), validated(standing.theta))]
+    history = [Round(0, standing.theta, (nan,) * len(names), validated(standing.theta))]
     for number in watched(range(1, plan.rounds + 1), progress, "round"):
         asked = participation.asked(seed, number, names)
         chosen = [client for client in clients if client.name in asked]
@@ -170,7 +170,7 @@ def federate(
         row = Round(
             number,
             standing.theta,
-            tuple(trained[name].loss if name in trained else math.nan for name in names),
+            tuple(trained[name].loss if name in trained else nan for name in names),
             tuple(new if name in asked and name not in rejected else old for name, new, old in reports),
             dict.fromkeys(answers, size + FLOAT32),
             dict.fromkeys(trained, size),
@@ -230,7 +230,7 @@ def adapt(
     draws = [generator(draw) for draw in streams]
     losses = torch.stack([loss for _, loss in descend(weights, model, pool, plans, rates, local, draws, stopped)], 1)
     return {
-        client.name: Trained(weights[r], math.nan, stopped[r])
+        client.name: Trained(weights[r], nan, stopped[r])
         if r in stopped
         else Trained(weights[r], float(losses[r, : len(plans[r])].mean()))
         for r, client in enumerate(clients)

@@ -1,9 +1,9 @@
 """The record of a federated training: its rounds, the selected net, and the traffic."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -118,7 +118,7 @@ class Federation:
         if not self.sizes:
             return self.history[0]
         typical = [np.median([_or_infinite(loss) for _, loss in self._reports(row)]) for row in self.history]
-        most = min(typical) + AGREEMENT * abs(min(typical)) if len(self._reports(self.history[0])) > 2 else math.inf
+        most = min(typical) + AGREEMENT * abs(min(typical)) if len(self._reports(self.history[0])) > 2 else inf
         agreed = [row for row, middle in zip(self.history, typical, strict=True) if middle <= most]
         return min(agreed, key=self.validation_loss)
 
@@ -144,7 +144,7 @@ class Federation:
 
 
 def _or_infinite(loss: float) -> float:
-    return loss if math.isfinite(loss) else math.inf
+    return loss if isfinite(loss) else inf
 
 
 def ledger(federation: Federation, overhead: int = 0) -> Ledger:

@@ -1,10 +1,10 @@
 """ServerApp of a federation: one of Flower's strategies, fed with screened answers, and its rounds as a checkpoint."""
 
-import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
+from math import nan
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -59,7 +59,7 @@ class Row(NamedTuple):
         """The round in one line of text."""
         total = sum(self.pieces[name] for name in self.validation_loss)
         losses = [self.pieces[name] * loss for name, loss in self.validation_loss.items()]
-        mean, missing = sum(losses) / total if total else math.nan, self.rejected.items()
+        mean, missing = sum(losses) / total if total else nan, self.rejected.items()
         why = "".join(f"; {name}: {reason}" for name, reason in missing) + f"; {self.note}" * bool(self.note)
         return f"round {self.number}: validation {mean:.4f} m^2 over {len(losses)} clients{why}"
 
@@ -262,7 +262,7 @@ def _theta(arrays: Any) -> Tensor:
 def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
     """The rounds as `federate` gives them: clients in the order of their names, and the last report of each."""
     sizes = {name: count for row in rows for name, count in row.pieces.items()}
-    names, last, history = sorted(sizes), dict.fromkeys(sizes, math.nan), []
+    names, last, history = sorted(sizes), dict.fromkeys(sizes, nan), []
     for row in rows:
         last |= row.validation_loss
         size, absent = 4 * len(row.weights), [n for n in names if n not in row.training_loss and n not in row.rejected]
@@ -270,7 +270,7 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
             Round(
                 row.number,
                 row.weights,
-                tuple(row.training_loss.get(name, math.nan) for name in names),
+                tuple(row.training_loss.get(name, nan) for name in names),
                 tuple(last[name] for name in names),
                 dict.fromkeys(row.training_loss, size + 4),
                 dict.fromkeys(row.training_loss, size),

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from coopoc import Recording, Track
@@ -56,7 +56,7 @@ class OptimisedKF(Alone):
         check_std(self, "gnss_std")
         check_fields(self)
 
-    def start(self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
+    def start(self, x0: ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
         """The filter as a stream, one step at a time (docs/streaming.md).
 
         Args:
@@ -78,7 +78,7 @@ class OptimisedKF(Alone):
         return solo_track(recording, columns, x, variance, began)
 
     def _motion(self, interval: float) -> MotionNoise:
-        base, ratio = np.array(self.process_std, dtype=float), np.array(self.velocity_ratio, dtype=float)
+        base, ratio = np.array(self.process_std, float), np.array(self.velocity_ratio, float)
         return MotionNoise(base, ratio, 0.0, 0.0, interval)
 
 

@@ -51,7 +51,7 @@ class MeasuredDrives:
         if truth.ids != recording.ids or len(truth.t) != len(recording.t):
             hint = "Give the truth on the steps of the recording, as read_log does."
             raise InputError("truth", repr(truth), "must hold the members and steps of the recording", hint)
-        moving = np.flatnonzero(np.abs(np.nan_to_num(recording.velocity)).max(axis=(0, 1, 3)))
+        moving = np.flatnonzero(abs(np.nan_to_num(recording.velocity)).max(axis=(0, 1, 3)))
         wanted = listed("ids", self.ids, "Give a tuple of ids, () for all that move.") or moving.tolist()
         cols = columns("vehicles", wanted, recording.ids)
         if not cols:

@@ -1,10 +1,10 @@
 """fit: train a net on pieces, and keep the weights that validate best; fit_okf: the nine numbers of an OptimisedKF."""
 
-import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -100,7 +100,7 @@ def fit(
         instance(field, pieces, Segments)
     began, theta, draw = time.perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
     plan, judge = schedule.plan(len(training), draw), Judge([[validation], *([] if long is None else [[long]])], model)
-    history, so_far = [Progress(0, theta[0].clone(), math.nan, float(judge(theta)))], []
+    history, so_far = [Progress(0, theta[0].clone(), nan, float(judge(theta)))], []
     due = set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist())
     rates, draws, stopped = schedule.learning_rate * cosine(len(plan)), [generator(draw)], dict[int, str]()
     steps = descend(theta, model, training, [plan], [rates], schedule, draws, stopped)
@@ -109,7 +109,7 @@ def fit(
         if step in due and not stopped:
             mean = float(torch.cat(so_far[history[-1].step :]).mean())
             history.append(Progress(step, theta[0].clone(), mean, float(judge(theta))))
-    if not stopped and min(row.validation_loss for row in history) == math.inf:
+    if not stopped and min(row.validation_loss for row in history) == inf:
         stopped[0] = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
     return Fit(model, tuple(history), stopped.get(0), time.perf_counter() - began)
 
@@ -133,7 +133,7 @@ def descend(
     moments = Moments(weights, np.zeros_like(weights), np.zeros_like(weights))
     for step in range(max(map(len, plans))):
         going = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
-        losses = np.full(len(plans), math.nan, np.float32)
+        losses = np.full(len(plans), nan, np.float32)
         for size in {plans[row].shape[1] for row in going}:
             rows = [row for row in going if plans[row].shape[1] == size]
             dice = [draws[r] for r in rows]
@@ -166,7 +166,7 @@ class Judge:
     def __call__(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
             parts = [(self.like.losses(theta, batch) * share).unbind(1) for batch, share in self.batches]
-        return torch.stack([reduce(torch.add, each) for each in parts]).nan_to_num(math.inf, math.inf).amax(0)
+        return torch.stack([reduce(torch.add, each) for each in parts]).nan_to_num(inf, inf).amax(0)
 
 
 def padded(parts: Sequence[Segments]) -> tuple[Batch, Tensor]:
@@ -219,7 +219,7 @@ def fit_okf(
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
                 validated = float(_loss(like, logs, *judge))
-            best = logs.detach().clone() if validated < min(history, default=math.inf) else best
+            best = logs.detach().clone() if validated < min(history, default=inf) else best
             history.append(validated)
         adam.zero_grad()
         _loss(like, logs, *data).backward()

@@ -9,6 +9,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 import torch
+from numpy.random import Generator
 
 from coopoc.arrays import Floats, Ints, Limits, check_fields
 from coopoc.errors import InputError, shown
@@ -49,7 +50,7 @@ class Schedule:
     def __post_init__(self) -> None:
         check_fields(self, LIMITS)
 
-    def plan(self, pieces: int, draw: np.random.Generator) -> Ints:
+    def plan(self, pieces: int, draw: Generator) -> Ints:
         """(steps, batch) indices of the pieces that each optimiser step sees, without repetition within a pass."""
         batch = min(self.batch, pieces)
         if self.epoch == "step":
@@ -70,7 +71,7 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
     return 0.5 * (1.0 + np.cos(np.pi * where))
 
 
-def generator(draw: np.random.Generator) -> torch.Generator:
+def generator(draw: Generator) -> torch.Generator:
     """A torch generator seeded by a keyed NumPy stream."""
     return torch.Generator().manual_seed(int(draw.integers(2**62)))
 

@@ -1,6 +1,7 @@
 """All positions of a drive as one dense least-squares problem, by Gauss-Newton to convergence."""
 
 import numpy as np
+from numpy.linalg import inv, norm, solve
 
 from coopoc.world.links import spherical, to_vector, wrap
 from oracles.messages import slopes
@@ -13,7 +14,7 @@ def batch_smoother(recording, noise_model, run, x):  # type: ignore[no-untyped-d
         np.broadcast_to(values, recording.gnss.shape)[run]
         for values in (noise_model.process_variance(recording), noise_model.fix_variance(recording))
     )
-    active = np.zeros(gnss.shape[:2], dtype=bool)
+    active = np.zeros(gnss.shape[:2], bool)
     for t, n in np.ndindex(active.shape):
         began = (t > 0 and active[t - 1, n]) or np.isfinite(gnss[t, n]).all()
         active[t, n] = np.isfinite(velocity[t, n]).all() and began
@@ -41,12 +42,12 @@ def batch_smoother(recording, noise_model, run, x):  # type: ignore[no-untyped-d
         for k, t, i, j in measurements(recording, run, active):
             H, off = rows(x[t, j] - x[t, i], seen[k], noise_model.sensors)
             add([((t, j), 1.0), ((t, i), -1.0)], H.T @ H, H.T @ off)
-        move = np.linalg.solve(A, b)
+        move = solve(A, b)
         for (t, n), at in index.items():
             x[t, n] += move[at : at + 3]
-        if np.abs(move).max() < 1e-10:
+        if abs(move).max() < 1e-10:
             break
-    cov, P = np.full((*x.shape, 3), np.nan), np.linalg.inv(A)
+    cov, P = np.full((*x.shape, 3), np.nan), inv(A)
     for (t, n), at in index.items():
         cov[t, n] = P[at : at + 3, at : at + 3]
     return x, cov
@@ -71,7 +72,7 @@ def rows(vector, measured, sensors):  # type: ignore[no-untyped-def]
     at = vector if sensors else to_vector(measured)
     J = slopes(at, least)
     if sensors is None:
-        J /= np.linalg.norm(J, axis=1)[:, None]
+        J /= norm(J, axis=1)[:, None]
         return J[there], J[there] @ (at - vector)
     off = measured - np.array(spherical(*vector))
     off[1:] = wrap(off[1:])

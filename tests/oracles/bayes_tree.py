@@ -31,7 +31,7 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
     if still is not None:
         model = gtsam.noiseModel.Unit.Create(dof)
         for i in np.flatnonzero(still.any(axis=1)).tolist():
-            graph.add(i, np.diag(still[i].astype(np.float64)), np.zeros(dof), model)
+            graph.add(i, np.diag(still[i].astype(float)), np.zeros(dof), model)
     for i in range(n):
         nothing.insert(i, np.zeros(dof))
     try:

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.linalg import norm, solve
+from numpy import nan
+from numpy.linalg import norm, slogdet, solve
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
@@ -139,7 +140,7 @@ class Belief:
             return
         p, m = self.p[np.ix_(some, some)], self.x[some]
         prior = np.broadcast_to(prior, len(which))[[i in some for i in which]]
-        odds += 0.5 * (np.log(prior).sum() - np.linalg.slogdet(p)[1] - m @ solve(p, m))
+        odds += 0.5 * (np.log(prior).sum() - slogdet(p)[1] - m @ solve(p, m))
         none, k = 1 / (1 + exp(min(-odds, 700))), solve(p, self.p[some]).T
         self.x, self.p = self.x - none * k @ m, self.p - none * k @ (p - (1 - none) * np.outer(m, m)) @ k.T
 
@@ -174,10 +175,10 @@ class Life(NamedTuple):
 
 def fresh(gnss: Floats, moved: Floats, variance: Floats) -> Floats:
     """Fixes (T, N, 3) but those that repeat the last one of their receiver, whose vehicle has moved."""
-    new, last = gnss.copy(), np.full(gnss.shape[1:], np.nan)
+    new, last = gnss.copy(), np.full(gnss.shape[1:], nan)
     moves = np.square(moved).sum(axis=-1) > 0.01 * variance[..., 0]
     for now, fix, goes in zip(new, gnss, moves, strict=True):
-        now[goes & (fix == last).all(axis=1)] = np.nan
+        now[goes & (fix == last).all(axis=1)] = nan
         last = np.where(np.isfinite(fix), fix, last)
     return new
 
@@ -273,7 +274,7 @@ class Oracle:
             self.gather(t)
             if np.isnan(u[0]) or not (self.state.belief.names or self.places(t, fix)):
                 self.reset()
-                found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
+                found.append((np.full(3, nan), np.full((3, 3), nan), []))
                 continue
             if not self.state.belief.names:
                 self.begin(t)
@@ -286,7 +287,7 @@ class Oracle:
             more, white = max(self.lasting(t) - np.trace(cov), self.others()), self.r[t, self.ego] * self.white
             here = x, cov + more * np.diag(white / white.sum())
             b, way = self.state.belief, self.state.way
-            at = [b.x[b.at("x", j)] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
+            at = [b.x[b.at("x", j)] + way[j] if j in way else np.full(3, nan) for j in self.neighbours(t)[1]]
             found.append((*here, at))
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
@@ -328,7 +329,7 @@ class Oracle:
             return x, cov
         fix, dt, before = self.fix[t], self.dt, self.state
         if self.state.unused == t:
-            fix = np.full(3, np.nan)
+            fix = np.full(3, nan)
         level = max(self.state.level[:3])
         self.state, self.deaf = self.lone, True
         self.pace(t)
@@ -491,7 +492,7 @@ class Oracle:
         louder = self.louder(self.ego)
         fix = self.fix[t].copy()
         if s.unused == t:
-            fix[:] = np.nan
+            fix[:] = nan
         seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix)
         if outvoted:
             s.trusted.add(self.ego)
@@ -672,7 +673,7 @@ class Oracle:
             return 0.0 if supported else 1.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ solve(own + np.diag(r), gap))
-        self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
+        self.count(min(square, FIX_SCORE), slogdet(own + np.diag(r))[1], len(used))
         mine, noise, locked = np.trace(own), r.sum(), s.locked
         if not judged:
             mine, noise = s.cov[used].sum(), noise * exp(-s.level[3])
@@ -796,7 +797,7 @@ class Oracle:
         s.agreed = 0.0
         s.vague.add(self.ego)
         if elsewhere:
-            fix[:], s.unused = np.nan, t
+            fix[:], s.unused = nan, t
             s.vague.discard(self.ego)
         return True
 
@@ -1128,4 +1129,4 @@ class Oracle:
 
 def normal(x: Floats, cov: Floats) -> float:
     """Logarithm of the density of N(0, cov)."""
-    return float(-0.5 * (np.linalg.slogdet(2 * pi * cov)[1] + x @ solve(cov, x)))
+    return float(-0.5 * (slogdet(2 * pi * cov)[1] + x @ solve(cov, x)))

@@ -5,6 +5,7 @@ vectors. A member whose measurement is incomplete has no edge.
 """
 
 import numpy as np
+from numpy.linalg import inv
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
@@ -26,5 +27,5 @@ def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel) ->
     weight = np.concatenate([np.repeat(1 / variance, 3), *fixes])
     h = np.kron(np.vstack([laplacian, np.eye(n)]), np.eye(3))
     z = np.concatenate([delta, [member.position for member in star]]).ravel()
-    p = np.linalg.inv(np.linalg.inv(p) + h.T * weight @ h)
+    p = inv(inv(p) + h.T * weight @ h)
     return x + (p @ h.T @ (weight * (z - h @ x.ravel()))).reshape(-1, 3), p

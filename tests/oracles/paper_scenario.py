@@ -7,6 +7,7 @@ with unit covariances, and by the joint filter of its star with the acting noise
 from typing import Any
 
 import numpy as np
+from numpy import inf, pi
 from numpy.linalg import inv, solve
 
 Array = Any
@@ -29,7 +30,7 @@ def cartesian(m: Array) -> Array:
 def nearest(position: Array, ego: int, most: int) -> list[int]:
     """Columns of the vehicles within 30 m, and further than 2 m, nearest first."""
     gap = np.sqrt(((position - position[ego]) ** 2).sum(-1))
-    gap[ego] = np.inf
+    gap[ego] = inf
     order = [j for j in np.argsort(gap) if gap[j] <= 30.0]
     return order[:most]
 
@@ -61,7 +62,7 @@ def joint(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int
             if m is not None:
                 v = at[3 * k : 3 * k + 3] - at[:3]
                 gap = m - polar(v)
-                gap[1] = (gap[1] + np.pi) % (2 * np.pi) - np.pi
+                gap[1] = (gap[1] + pi) % (2 * pi) - pi
                 slope = np.array([(polar(v + e) - polar(v - e)) / 2e-5 for e in 1e-5 * np.eye(3)]).T
                 j = np.zeros((3, len(at)))
                 j[:, :3], j[:, 3 * k : 3 * k + 3] = -slope, slope
@@ -95,8 +96,8 @@ def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.rand
         there = np.isfinite(at[:, 0])
         fixes = at + rng.normal(0, FIX, at.shape)
         measured = speed * (1 + RATIO * rng.normal(size=speed.shape))
-        std = np.maximum(RATIO * np.abs(measured), FLOOR)
-        star = [ego, *(j for j in nearest(np.where(there[:, None], at, np.inf), ego, most))]
+        std = np.maximum(RATIO * abs(measured), FLOOR)
+        star = [ego, *(j for j in nearest(np.where(there[:, None], at, inf), ego, most))]
         truth = [polar(at[j] - at[ego]) for j in star[1:]]
         noisy = [m + rng.normal(size=3) * [RANGE, ANGLE, ANGLE] for m in truth]
         relative = [None, *(m if d[0] >= 2.0 else None for m, d in zip(noisy, truth, strict=True))]

@@ -10,7 +10,7 @@ FLAT, UNKNOWN = 1e6, np.pi**2 / 3
 
 def jacobian(f, x, size=1e-6):  # type: ignore[no-untyped-def]
     """Derivatives (M, n) of f at x (n,) by central differences."""
-    steps = size * np.diag(1 + np.abs(x))
+    steps = size * np.diag(1 + abs(x))
     return np.stack([(f(x + h) - f(x - h)) / (2 * h.sum()) for h in steps], axis=1)
 
 

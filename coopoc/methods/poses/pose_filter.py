@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
+from numpy import inf, nan
 
 from ...arrays import Bools, Floats, Ints, check_fields, checked, number, refuse
 from ...errors import InputError
@@ -105,7 +106,7 @@ class PoseFilter:
         check_fields(self)
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
-        number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="A gate of 4 rejects outliers.")
+        number("gate", self.gate, 1.0, inf, allowed=">= 1 standard deviation", hint="A gate of 4 rejects outliers.")
         refuse(
             "spread", self._spread, ~(self._spread > 0), "must be > 0", "Give standard deviations in m, m, m and rad."
         )
@@ -202,7 +203,7 @@ class PoseFilter:
             starts = 1 + np.flatnonzero(there[1:, column] & ~there[:-1, column])
             for again, start in enumerate(starts.tolist(), 1):
                 if again == len(every):
-                    every.append(np.full_like(every[0], np.nan))
+                    every.append(np.full_like(every[0], nan))
                 part = recording.between(start, min(start + int(START_SECONDS / recording.dt) + 2, len(there)))
                 with suppress(*[InputError] * (self.unit == "fleet")):
                     if not has_pose[start, column] and len(part.t) > 1:
@@ -230,7 +231,7 @@ class PoseFilter:
         if self.assumed is None:
             raise InputError("assumed", None, "is needed: a stream has no recording", "Give assumed=Sensors(...).")
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
-        first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
+        first = np.full(4, nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         radians("headings of begin", first[3:])
         return PoseStream(self._settings(self.assumed, dt), first, self._spread, dt)
 
@@ -270,7 +271,7 @@ class PoseFilter:
 
     def _settings(self, sensors: Sensors, dt: float) -> "PoseNoise":
         """What it assumes, and its options, as the kernel takes them."""
-        noise = pose_noise(sensors, dt, self.gate if self.robust else np.inf, self.lasting is not False)
+        noise = pose_noise(sensors, dt, self.gate if self.robust else inf, self.lasting is not False)
         numbers = 4 + 2 * (self.lasting is True or any(noise.lasting)) + int(noise.longer)
         numbers = 10 if any(noise.lasting[3:]) else numbers
         passes, fusion = PASSES if self.exact else 1, get_args(Fusion).index(self.fusion)
@@ -321,7 +322,7 @@ def pose_start(recording: Recording, *, seconds: float = START_SECONDS, gate: fl
 def _seen(recording: Recording, columns: Sequence[int], x: Floats, members: Sequence[int]) -> Floats:
     """(R, L, 3) m, by link of each ego, where what it measures is: a landmark, or a member by its state x (R, T, n, d);
     NaN where nothing is known."""
-    places = np.full(recording.gnss.shape, np.nan)
+    places = np.full(recording.gnss.shape, nan)
     places[:, :, list(recording.landmarks)] = recording.gnss[:, :, list(recording.landmarks)]
     places[:, :, list(members)] = x[:, :, : len(members), :3]
     links, own = recording.links, np.concatenate([recording.links.of(column) for column in columns])

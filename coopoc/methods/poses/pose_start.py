@@ -5,6 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy import nan, pi
+from numpy.linalg import matrix_rank, norm, pinv
 
 from ...arrays import Floats, Ints
 from ...errors import InputError
@@ -16,15 +18,15 @@ from .pose_inputs import body_of, to_landmarks
 
 HEADINGS, SEEN_PLACES = 24, 3
 """Headings that are tried, around the circle and then around the best of them; most places that each is tried with."""
-HEADING_STEP = 2 * np.pi / HEADINGS  # rad
+HEADING_STEP = 2 * pi / HEADINGS  # rad
 
 
 def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> Floats:
     """Poses (R, N, 4) of some vehicles at the first step, as `pose_start` says, by a solo PoseFilter."""
-    begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
+    begin = np.full((recording.runs, len(recording.ids), 4), nan)
     for run in range(recording.runs):
         one = recording.of_runs(slice(run, run + 1))
-        positions = np.full((len(recording.t), len(recording.ids), 3), np.nan)
+        positions = np.full((len(recording.t), len(recording.ids), 3), nan)
         positions[:, list(recording.landmarks)] = one.gnss[0][:, list(recording.landmarks)]
         waiting = list(members)
         while waiting:
@@ -56,12 +58,12 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
     landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
     noise, angles = recording.sensors, HEADING_STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
-        apart, ranges = np.linalg.norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[0, links, 0]
+        apart, ranges = norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[0, links, 0]
         filter_ = replace(filter_, assumed=_of_vehicles(noise, np.where(np.isnan(ranges), apart, ranges)))
 
     def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats, Floats]:
         """States (H, T, d), their covariances, and costs (H,), from poses (H, 4) whose headings err by that."""
-        tried = np.full((len(poses), len(recording.ids), 4), np.nan)
+        tried = np.full((len(poses), len(recording.ids), 4), nan)
         tried[:, column] = poses
         spread = [2 * max(std, noise.range_std) for std in noise.fix_std]  # of one fix or one landmark, m
         own = replace(filter_, spread=(*spread, turn))
@@ -162,7 +164,7 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     else:
         first = complete[np.sort(np.unique(places[complete], axis=0, return_index=True)[1])[:SEEN_PLACES]]
         step, at = recording.links.step[links[first]], places[first]
-        polar = np.where(np.isfinite(relative[first]), relative[first], np.pi / 2)
+        polar = np.where(np.isfinite(relative[first]), relative[first], pi / 2)
         offset = way[step] + turned(to_vector(polar), turns[step])
     position = at - turned(np.broadcast_to(offset, (len(angles), *offset.shape)), angles[:, None])
     return np.column_stack([position.reshape(-1, 3), np.repeat(angles, len(step))])
@@ -173,7 +175,7 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     (T, 3) m of the tag by odometry."""
     rows = np.flatnonzero(np.isfinite(recording.relative[0, links, 0]))
     at, first = np.unique(places[rows], axis=0, return_index=True)
-    if not len(at) or np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), LINE_WIDTH) < 2:
+    if not len(at) or matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), LINE_WIDTH) < 2:
         actual = f"{recording.ids[column]} has no fix and sees too little in {recording.t[-1] - recording.t[0]:g} s"
         allowed = "a fix, or a range and bearing or three ranges, of landmarks or vehicles whose poses are found"
         raise InputError("seconds", actual, f"must hold {allowed}", "Take more seconds, or give its pose.")
@@ -183,5 +185,5 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
     right = np.square(centres[..., :2]).sum(axis=-1) - recording.relative[0, links[rows], 0] ** 2
     matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
-    position = (np.linalg.pinv(matrix) @ right[..., None])[:, :2, 0]
+    position = (pinv(matrix) @ right[..., None])[:, :2, 0]
     return np.column_stack([position, centres[..., 2].mean(axis=1), angles])

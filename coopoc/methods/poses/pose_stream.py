@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy import inf, nan
+from numpy.typing import ArrayLike
 
 from ...arrays import Floats, instance, number
 from ...errors import InputError
@@ -31,19 +32,17 @@ class OwnMeasurement:
     (8,)
     """
 
-    velocity: npt.ArrayLike
+    velocity: ArrayLike
     yaw_rate: float
-    gnss: npt.ArrayLike | None = None
+    gnss: ArrayLike | None = None
     heading: float | None = None
     row: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        heading = np.nan
+        heading = nan
         if self.heading is not None and not (isinstance(self.heading, float) and np.isnan(self.heading)):
-            heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
-        rate = number(
-            "yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Give 0 for a vehicle that stands."
-        )
+            heading = number("heading", self.heading, -inf, allowed="finite rad, or None", hint="None: no compass.")
+        rate = number("yaw_rate", self.yaw_rate, -inf, allowed="finite rad/s", hint="Give 0 for a vehicle that stands.")
         radians("heading", np.array(heading), UNWRAPPED)
         radians("yaw_rate", np.array(rate), MAX_YAW_RATE)
         moving = three("velocity", self.velocity, MAX_SPEED)
@@ -62,8 +61,8 @@ class LandmarkMeasurement:
     [9.0, 0.1, 1.57]
     """
 
-    relative: npt.ArrayLike
-    position: npt.ArrayLike
+    relative: ArrayLike
+    position: ArrayLike
 
     def __post_init__(self) -> None:
         self.__dict__["relative"] = relative_vector(self.relative)
@@ -98,7 +97,7 @@ class PoseStream:
         from ...kernels.poses.scalar_update import new_poses
 
         self._noise, self._spread, self._dt = noise, spread, dt
-        self._begin, self._later, self._heading = begin[None, None, None], False, np.nan
+        self._begin, self._later, self._heading = begin[None, None, None], False, nan
         self._poses, self._pair = (new_poses(count * noise.d + 1) for count in (1, 2))
         self._faults = new_faults(1, noise, dt)
 
@@ -124,11 +123,11 @@ class PoseStream:
             what = "must give what the first fix and compass do not"
             raise InputError("begin", None, what, "Give (x, y, z, heading).")
         t, count = int(self._later), len(marks)
-        positions = np.array([mark.position for mark in marks], dtype=float).reshape(-1, 3)
-        relative = np.array([mark.relative for mark in marks], dtype=float).reshape(1, -1, 3)
+        positions = np.array([mark.position for mark in marks], float).reshape(-1, 3)
+        relative = np.array([mark.relative for mark in marks], float).reshape(1, -1, 3)
         both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1, 0], (count, 1))
         first = np.array([0, 0, count] if t else [0, count, count])
-        active = np.ones((2, 1), dtype=bool)
+        active = np.ones((2, 1), bool)
         measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt, np.zeros((2, 3)))
         memory = self._poses, self._pair, self._faults
         step(measured, self._noise, self._begin, self._spread, *memory, 0, t)

@@ -41,7 +41,7 @@ class Cholesky:
         self._kernels = multifrontal  # to import it again at each call takes as long as to factor a star
         size = len(indptr) - 1
         pattern = indptr, indices, np.arange(size) if group is None else group
-        self._fronts = analysed(*(part.astype(np.int64).tobytes() for part in pattern))
+        self._fronts = analysed(*(part.astype(int).tobytes() for part in pattern))
         self._rank = np.argsort(self._fronts.order)
         column = np.repeat(np.arange(size), np.diff(indptr))
         self._place = multifrontal.places(self._fronts, self._rank[indices], self._rank[column])
@@ -100,7 +100,7 @@ def with_still(matrix: Any, added: Floats | Bools) -> Any:
     """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
     from scipy.sparse import diags_array
 
-    return matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
+    return matrix + diags_array(np.asarray(added, float).ravel())
 
 
 @lru_cache(maxsize=3)
@@ -116,17 +116,17 @@ def analysed(*pattern: bytes) -> Any:
 
     from ...kernels.graphs.multifrontal import Fronts, postorder, supernodes
 
-    indptr, indices, group = (np.frombuffer(part, np.int64) for part in pattern)
+    indptr, indices, group = (np.frombuffer(part, int) for part in pattern)
     _, begin, width = np.unique(group, return_index=True, return_counts=True)
     u, n = len(group), len(width)
     of = csr_array((np.ones(u), np.repeat(np.arange(n), width), np.arange(u + 1)), shape=(u, n))
     upper = of.T @ csc_array((np.ones(len(indices)), indices, indptr), shape=(u, u)) @ of
     order, lower = eliminated((upper + upper.T).tocsc(), u / max(n, 1))
-    later = postorder(_parents(lower), np.diff(lower.indptr).astype(np.int64))
+    later = postorder(_parents(lower), np.diff(lower.indptr).astype(int))
     order, lower = order[later], lower[later][:, later]
     lower.sort_indices()
     begin, width = begin[order], width[order]
-    head = supernodes(_parents(lower), lower.indptr.astype(np.int64), lower.indices.astype(np.int64), width)
+    head = supernodes(_parents(lower), lower.indptr.astype(int), lower.indices.astype(int), width)
     first, below = np.append(0, np.cumsum(width)), lower[head[1:] - 1]
     rows, columns = below.indices, np.diff(first[head])
     row = np.append(0, np.cumsum(width[rows]))[below.indptr]
@@ -159,7 +159,7 @@ def _filled(pattern: Any, by_degree: bool) -> tuple[Ints, Any]:
     n = pattern.shape[0]
     upper, order = ca.Sparsity(n, n, pattern.indptr.tolist(), pattern.indices.tolist()).ldl(by_degree)
     indptr, indices = upper.get_ccs()
-    return np.array(order, dtype=np.int64), csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n)).tocsr()
+    return np.array(order, int), csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n)).tocsr()
 
 
 def _work(found: tuple[Ints, Any]) -> float:
@@ -177,13 +177,13 @@ def _dissected(pattern: Any) -> Ints:
         graph.push_factor(*pair)
     found = Ordering.MetisSymbolicFactorGraph(graph)
     order = [found.at(k) for k in range(found.size())]
-    return np.append(order, np.setdiff1d(np.arange(pattern.shape[0]), order)).astype(np.int64)
+    return np.append(order, np.setdiff1d(np.arange(pattern.shape[0]), order)).astype(int)
 
 
 def _parents(lower: Any) -> Ints:
     """(n,) the first row of each column, -1 if there is none."""
     first = np.append(lower.indices, -1)[lower.indptr[:-1]]
-    return np.where(np.diff(lower.indptr) > 0, first, -1).astype(np.int64)
+    return np.where(np.diff(lower.indptr) > 0, first, -1).astype(int)
 
 
 def _runs(first: Ints, length: Ints) -> Ints:

@@ -87,7 +87,7 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
     row, column = np.broadcast_arrays(number[i][:, :, None], number[j][:, None, :])
     there = (row >= 0) & (row <= column)
     row, column = row[there], column[there]
-    order, index = np.lexsort((row, column)), np.full(there.shape, -1, dtype=np.int64)
+    order, index = np.lexsort((row, column)), np.full(there.shape, -1, int)
     index.ravel()[np.flatnonzero(there)[order]] = np.arange(len(order))
     return Entries(number, key, index, np.searchsorted(column[order], np.arange(m + 1)), row[order])
 
@@ -102,7 +102,7 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
     """
     m, nowhere, dof = entries.size, entries.size + 1 + len(entries.indices), entries.number.shape[1]
     columns = np.concatenate([entries.number[node].T for node in nodes.T])
-    goal = np.zeros((len(written), len(nodes)), dtype=np.int32)
+    goal = np.zeros((len(written), len(nodes)), np.int32)
     i, j = written.T
     gradient = (i >= 0) & (j < 0)
     goal[gradient] = np.where(columns[i[gradient]] < 0, nowhere, 1 + columns[i[gradient]])

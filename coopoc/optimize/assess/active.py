@@ -99,7 +99,7 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     for members, columns, block in _apart(rows.matrix[touched]):
         own = touched[members]
         unit, pull = block / length[own, None], gradient.ravel()[columns]
-        scale = max(np.abs(pull).max(), 1e-300)
+        scale = max(abs(pull).max(), 1e-300)
         bounds = np.where((low | equal)[own], -np.inf, 0.0), np.where((high | equal)[own], np.inf, 0.0)
         of_active = scale * lsq_linear(unit.T, -pull / scale, bounds, method="bvls", tol=1e-14).x
         multipliers[own] = of_active / length[own]

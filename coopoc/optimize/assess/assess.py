@@ -6,6 +6,7 @@ from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy import inf, nan
 from numpy.linalg import LinAlgError, eigh, norm, qr
 
 from ...arrays import Bools, Floats, checked, instance
@@ -65,7 +66,7 @@ class Assessment:
     remaining: float
     unobservable: tuple[str, ...] = ()
     active: Active | None = None
-    predicted: float = np.inf
+    predicted: float = inf
     curved: bool = False
     newton: bool = False
 
@@ -97,10 +98,10 @@ def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = F
     except LinAlgError:
         sound = False
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
-        unknown = np.full((*still.shape, still.shape[1]), np.nan)
-        return Assessment(linear.cost, size, unknown, np.nan, _unobservable(problem, J, active), active)
+        unknown = np.full((*still.shape, still.shape[1]), nan)
+        return Assessment(linear.cost, size, unknown, nan, _unobservable(problem, J, active), active)
     cov = cov * ~(still[:, :, None] | still[:, None, :])
-    return Assessment(linear.cost, size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
+    return Assessment(linear.cost, size, cov, float(abs(dx).max(initial=0.0)), (), active)
 
 
 def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = False) -> Assessment:
@@ -112,18 +113,18 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
     system = sparse(problem)
     cholesky, entries = system.cholesky, system.entries
     cost, gradient, values = system.quadratic(x, "newton" if quick else "gauss-newton")
-    none = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
+    none = np.full((len(x), *(problem.space.dof,) * 2), nan)
     if not (quick or (np.isfinite(values).all() and np.isfinite(cost))):
-        return Assessment(cost, np.inf, none, np.nan)
+        return Assessment(cost, inf, none, nan)
     size = float(norm(gradient))
-    unknown = Assessment(cost, size, none, np.nan)
+    unknown = Assessment(cost, size, none, nan)
 
     def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
-        far = float(np.abs(dx).max(initial=0.0))
+        far = float(abs(dx).max(initial=0.0))
         return Assessment(cost, size, cov, far, predicted=0.5 * abs(float(gradient @ dx)), curved=curved)
 
     own, cov = _largest(problem, entries, values[entries.diagonal]), none
-    step = variance = np.full(entries.size, np.inf)
+    step = variance = np.full(entries.size, inf)
     if held := cholesky.factor(values):
         step, variance = cholesky.solve(gradient), 1.0 / cholesky.pivots
         if not quick and (covariance or not (variance * own < INFLATION).all()):
@@ -134,8 +135,8 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         return _unconstrained(problem, x, covariance)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
-        scale, steepness = own + (own == 0), _largest(problem, entries, np.abs(gradient))
-        flat = FLAT_CURVATURE + (steepness / scale + np.finfo(float).eps * np.abs(x).max()) / LEVER
+        scale, steepness = own + (own == 0), _largest(problem, entries, abs(gradient))
+        flat = FLAT_CURVATURE + (steepness / scale + np.finfo(float).eps * abs(x).max()) / LEVER
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return replace(unknown, unobservable=nodes)
@@ -162,7 +163,7 @@ def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]
     """Marginals (n, dof, dof) under the noise that is stated, and their diagonal (m,); the cost's factor is at hand."""
     system, stated = sparse(problem), as_stated(problem)
     free, rows, columns = system.entries.marginals
-    blocks, cov = np.full(len(rows), np.nan), np.zeros(free.shape)
+    blocks, cov = np.full(len(rows), nan), np.zeros(free.shape)
     if stated is problem or system.cholesky.factor(sparse(stated).quadratic(x, model)[2]):
         blocks = system.cholesky.inverse(rows, columns)
     cov[free] = blocks
@@ -243,7 +244,7 @@ def _unobservable(
         values, turned = eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
         moves = np.zeros(J.shape[1])
         ways_squared = np.square(basis @ turned)
-        moves[moving] = ways_squared[:, np.abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
+        moves[moving] = ways_squared[:, abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
     moves = moves.reshape(len(problem.names), -1).sum(axis=1)
     return tuple(compress(problem.names, moves > 1e-6))
 
@@ -291,7 +292,7 @@ def _seen(J: Any, ways: Floats) -> Bools:
     some row keeps a share of its terms.
     """
     rows = _evened(J)
-    left, terms = np.abs(rows @ ways), abs(rows) @ np.abs(ways)
+    left, terms = abs(rows @ ways), abs(rows) @ abs(ways)
     matters = terms > 1e-6 * terms.max(axis=0)  # a chain bends by angles that are small beside its length
     return np.asarray((matters & (left > CANCELLED * terms)).any(axis=0))
 
@@ -353,7 +354,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     unknowns, notes, rejected = sparse(problem).size, [], []
     spent, out, pushing = 0.0, 0, 0
     if not np.isfinite(truth.cost):
-        return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)
+        return nan, ("the cost overflows: z, x0 or 1/std is too large",)
     if truth.curved:
         lost = "there is no covariance, and others may cost as little"
         what = lost if np.isnan(truth.covariance).all() else "the covariance is that of the exact Hessian"
@@ -411,7 +412,7 @@ def as_stated(problem: Problem) -> Problem:
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
     """(M,) |W (h(x) - z)|^2 of the measurements of a factor at x (n, ambient)."""
     (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], None, x).residual
-    return np.asarray(np.square(residual).sum(axis=-1))
+    return np.asarray(np.vecdot(residual, residual))
 
 
 def implausible(cost: float, mean: float, variance: float) -> bool:

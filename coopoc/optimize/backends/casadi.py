@@ -77,7 +77,7 @@ def solver(
         step[free] = at
         if np.isfinite(at).all():
             x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
-        if not space.has_rotation or status in HOPELESS or np.abs(x - before).max(initial=0.0) <= tolerance:
+        if not space.has_rotation or status in HOPELESS or abs(x - before).max(initial=0.0) <= tolerance:
             break
     return SolverResult(x, count, status == HOPELESS[0], {"return_status": status})
 

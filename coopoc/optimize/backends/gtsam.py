@@ -166,7 +166,7 @@ def _chord(W: Floats, z: Floats, d: int) -> Form:
         W: of the translation, or of it and the rotation.
         z: (M, ambient) poses.
     """
-    information = np.swapaxes(W, -1, -2) @ W
+    information = W.mT @ W
     weight = np.zeros((len(W), (d + 1) ** 2))
     expected = np.zeros_like(information)
     rotation = [d + k + d * np.arange(d) for k in range(W.shape[-1] // d - 1)]  # our residuals of each column
@@ -175,7 +175,7 @@ def _chord(W: Floats, z: Floats, d: int) -> Form:
         weight[:, (d + 1) * (column % (d + 1)) + np.arange(d)] = own[:, None]
         expected[:, rows, rows] = own[:, None]
     scale = np.sqrt(np.einsum("mii->mi", information))
-    if (np.abs(information - expected) > WEIGHT_TOLERANCE * scale[:, :, None] * scale[:, None, :]).any():
+    if (abs(information - expected) > WEIGHT_TOLERANCE * scale[:, :, None] * scale[:, None, :]).any():
         return None
     return _between("FrobeniusBetweenFactor", d, z, np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1]))
 
@@ -183,7 +183,7 @@ def _chord(W: Floats, z: Floats, d: int) -> Form:
 def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     if _coupled(W, d):
         return None
-    root = W[:, :d, :d] @ np.swapaxes(Space(d, has_rotation=True).rotation(factor.z), -1, -2)
+    root = W[:, :d, :d] @ Space(d, has_rotation=True).rotation(factor.z).mT
     return [
         Part({(POSE,): f"PoseTranslationPrior{d}D"}, zip(factor.z[:, :d], strict=True), root),
         Part({(POSE,): f"PoseRotationPrior{d}D"}, ((pose_of(d, each).rotation(),) for each in factor.z), W[:, d:, d:]),
@@ -192,7 +192,7 @@ def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
 
 def _coupled(W: Floats, d: int) -> bool:
     """Whether position and rotation are correlated."""
-    return bool(max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max()) > WEIGHT_TOLERANCE * np.abs(W).max())
+    return bool(max(abs(W[:, :d, d:]).max(), abs(W[:, d:, :d]).max()) > WEIGHT_TOLERANCE * abs(W).max())
 
 
 FORMS = {

@@ -139,8 +139,8 @@ class Programme:
         own, value = values[self._pattern.indptr[1:] - 1], self._rows @ dx
         self._pattern.data = values
         rest = self._pattern @ dx + self._pattern.T @ dx - own * dx + q
-        weak = KKT * float(np.maximum(np.abs(q), np.abs(own * dx)).max(initial=0.0))
-        if not (np.abs(rest + self._rows.T @ y) <= weak + NEGLIGIBLE * own).all():
+        weak = KKT * float(np.maximum(abs(q), abs(own * dx)).max(initial=0.0))
+        if not (abs(rest + self._rows.T @ y) <= weak + NEGLIGIBLE * own).all():
             return False
         kept = (value >= lower - BOUND_TOLERANCE) & (value <= upper + BOUND_TOLERANCE)
         pushed = ((y <= weak) | (value >= upper - BOUND_TOLERANCE)) & (

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.linalg import det, norm, svd
 
 from ...arrays import Floats, Ints
 from ...errors import InputError
@@ -75,10 +76,10 @@ class Quadratic:
         """X (N, columns) of positions (n, d) m and rotations (n, d, d); a unit vector is drawn along each range."""
         at = position - self.origin
         gap = at[self.edges[:, 0]] - at[self.edges[:, 1]]
-        length = np.linalg.norm(gap, axis=1, keepdims=True)
+        length = norm(gap, axis=1, keepdims=True)
         unit = np.where(length > 0, gap / np.maximum(length, 1e-300), np.eye(self.dimension)[0])
         frame = np.eye(self.columns)[: self.columns * self.framed]
-        turned = np.swapaxes(rotation[self.poses], 1, 2).reshape(-1, self.dimension)
+        turned = rotation[self.poses].mT.reshape(-1, self.dimension)
         return np.concatenate([frame, *(part.reshape(-1, self.columns) for part in (turned, unit, at[self.nodes]))])
 
     def drop(self, X: Floats) -> tuple[Floats, Floats]:
@@ -89,8 +90,8 @@ class Quadratic:
         at = X[self.bound :].reshape(-1, d)
         position, rotation = self.position.copy(), self.rotation.copy()
         if poses:
-            turned = np.swapaxes(X[self.stiefel[-poses:].ravel()].reshape(poses, d, d), 1, 2)
-            if not self.framed and np.linalg.det(turned).sum() < 0:
+            turned = X[self.stiefel[-poses:].ravel()].reshape(poses, d, d).mT
+            if not self.framed and det(turned).sum() < 0:
                 mirror = np.diag([*np.ones(d - 1), -1.0])
                 at, turned = at @ mirror, mirror @ turned
             rotation[self.poses] = nearest_rotation(turned)
@@ -138,14 +139,14 @@ class Multipliers:
 
 def multipliers(problem: Quadratic, X: Floats, CX: Floats) -> Multipliers:
     """In closed form at X (bound, p)."""
-    block = CX[problem.stiefel] @ np.swapaxes(X[problem.stiefel], 1, 2)
+    block = CX[problem.stiefel] @ X[problem.stiefel].mT
     along = np.einsum("mqp,mqp->m", CX[problem.sphere], X[problem.sphere])
-    return Multipliers(problem, 0.5 * (block + np.swapaxes(block, 1, 2)), along)
+    return Multipliers(problem, 0.5 * (block + block.mT), along)
 
 
 def orthogonal(blocks: Floats) -> Floats:
     """The nearest matrices with orthonormal rows to (..., k, p)."""
-    u, _, v = np.linalg.svd(blocks, full_matrices=False)
+    u, _, v = svd(blocks, full_matrices=False)
     return np.asarray(u @ v)
 
 
@@ -209,7 +210,7 @@ class _Rows:
 
     def __init__(self, problem: Problem, stacked: bool, framed: bool, ranges: int, origin: Floats) -> None:
         self.d, self.n, self.origin, self.framed = problem.dimension, len(problem.names), origin, framed
-        self.poses, self.fixed = (np.array(each, dtype=np.int64) for each in (problem.poses, problem.fixed))
+        self.poses, self.fixed = (np.array(each, int) for each in (problem.poses, problem.fixed))
         self.stacked, self.width = stacked, self.d if stacked else 1
         self.frame = np.arange((1 if stacked else self.d) * framed)
         self.first_unit = len(self.frame) + self.d * len(self.poses)
@@ -219,7 +220,7 @@ class _Rows:
 
     def rotation(self, node: Ints) -> Ints:
         """(M, d) rows of X with the R^T of poses."""
-        order = np.full(self.n, -1, dtype=np.int64)
+        order = np.full(self.n, -1, int)
         order[self.poses] = np.arange(len(self.poses))
         return len(self.frame) + self.d * order[node][:, None] + np.arange(self.d)
 
@@ -261,7 +262,7 @@ class _Rows:
         gone = np.concatenate([at.ravel(), self.rotation(turned).ravel()])
         values = [position[fixed].reshape(at.size, -1)]
         if len(turned):
-            values.append(np.swapaxes(rotation[turned], 1, 2).reshape(-1, self.d))
+            values.append(rotation[turned].mT.reshape(-1, self.d))
         frame = A[:, :size] + A[:, gone] @ csr_array(np.concatenate(values))
         return hstack([frame, A[:, np.setdiff1d(np.arange(size, A.shape[1]), gone)]], format="csr")
 
@@ -322,7 +323,7 @@ def _weighed(factor: Factor, d: int) -> tuple[Floats, Floats, Floats]:
     position, turn = one_weight(root[:, :d, :d]), one_weight(root[:, d:, d:])
     if position is None or turn is None or root[:, :d, d:].any() or root[:, d:, :d].any():
         _refuse(factor)
-    return position[:, None, None], turn[:, None, None], np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
+    return position[:, None, None], turn[:, None, None], factor.z[:, d:].reshape(-1, d, d).mT
 
 
 def one_weight(root: Floats) -> Floats | None:

@@ -14,6 +14,7 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.linalg import eigh, eigvalsh, svd
 
 from ...arrays import Bools, Floats
 from ...errors import InputError, said
@@ -48,7 +49,7 @@ class Reduced:
         _, first, label = np.unique(part * width + np.arange(len(part)) % width, return_index=True, return_inverse=True)
         whole = csc_array((np.ones(len(label)), (np.arange(len(label)), label)), shape=(len(label), len(first)))
         moved, terms = (abs(each).max(axis=0).toarray().ravel() for each in (free @ whole, abs(free) @ whole))
-        kept = np.ones(self.problem.rows.shape[1], dtype=bool)
+        kept = np.ones(self.problem.rows.shape[1], bool)
         kept[bound + first[moved <= 1e-9 * terms]] = False
         return kept
 
@@ -105,7 +106,7 @@ class Reduced:
 
         size = self.problem.bound
         if size <= FORMED_ROWS:
-            return np.linalg.eigvalsh(self.matrix - L.matrix.toarray())[:count]
+            return eigvalsh(self.matrix - L.matrix.toarray())[:count]
         less, shift, factored, rest = L.matrix, -1e-7 * self.scale, None, self.gram.shape[0] - size
         while factored is None:  # the Schur complement of this matrix is C - less - shift I
             shift *= 10.0
@@ -198,9 +199,9 @@ def shor(problem: Problem) -> Relaxation:
     reduced = Reduced(form)
     block, sphere, Z = semidefinite(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
     bound = reduced.lower_bound(Multipliers(form, block, sphere))[0]
-    values, vectors = np.linalg.eigh(Z)
+    values, vectors = eigh(Z)
     Y, d, space = vectors * np.sqrt(np.maximum(values, 0.0)), form.columns, problem.space
-    _, values, rows = np.linalg.svd(Y, full_matrices=False)
+    _, values, rows = svd(Y, full_matrices=False)
     gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
     top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
     x = space.join(*form.drop(reduced.settle(form.project(top))))
@@ -237,7 +238,7 @@ def semidefinite(
             hint = "Solve it, and ask certify(problem, solution)."
             raise InputError("problem", said(error), "must be one that Clarabel solves", hint) from None
         block = -scale * np.array([each.dual_value for each in turns]).reshape(n, k, k)
-        return (block + block.swapaxes(1, 2)) / 2, -scale * np.array([each.dual_value for each in units]), Z.value
+        return (block + block.mT) / 2, -scale * np.array([each.dual_value for each in units]), Z.value
 
     return run
 

@@ -105,7 +105,7 @@ def arrive(
             damping = _marquardt(system, undamped[2], mu, LEAST_INFORMATION if bounded else 1.0)
             whole = values
             if damping is not None:
-                whole = values.astype(np.float64)
+                whole = values.astype(float)
                 whole[system.entries.diagonal] += damping
             taken = step(x, whole, gradient)
             if taken is None:
@@ -125,7 +125,7 @@ def arrive(
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
             after = trial[0]
-            length = float(np.abs(dx).max(initial=0.0))
+            length = float(abs(dx).max(initial=0.0))
             small, swift = length <= tolerance, model == "newton" and not mu and not bounded
             hidden = predicted <= HIDDEN * cost and (after <= cost * (1.0 + 1e-13) or (small and bounded))
             gain = 1.0 if hidden else (cost - after) / abs(predicted)

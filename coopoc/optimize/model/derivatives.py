@@ -69,7 +69,7 @@ class Term(NamedTuple):
     @property
     def nodes(self) -> Ints:
         """(M, arity)."""
-        return np.frombuffer(self.raw, np.int64).reshape(-1, self.kind.measurement.arity)
+        return np.frombuffer(self.raw, int).reshape(-1, self.kind.measurement.arity)
 
 
 class Structure(NamedTuple):
@@ -291,7 +291,7 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.cse(ca.substitute(ca.vertcat(*outputs), steps, ca.SX.zeros(steps.size1())))
     kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
     function = ca.Function("tape", [ca.vertcat(nodes, number)], [ca.densify(here[kept])])
-    return Written(_tape(function, kind.measurement.name), np.array([entries[k] for k in kept], dtype=np.int64))
+    return Written(_tape(function, kind.measurement.name), np.array([entries[k] for k in kept], int))
 
 
 def _tape(function: Any, name: str) -> "Tape":
@@ -301,7 +301,7 @@ def _tape(function: Any, name: str) -> "Tape":
     operations, constant = _operations(), int(Operation.CONST)
     read_in, write_out = int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
-    code, operands, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
+    code, operands, value = np.zeros(count, int), np.zeros((count, 3), int), np.zeros(count)
     for k in range(count):
         instruction = function.instruction_id(k)
         if instruction not in operations:
@@ -360,7 +360,7 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
         total = np.zeros((1 + arity * dof) * end)
         accumulate(write(kind, "jacobian").tape, x, factor.nodes, numbers_of(factor), _goal(kind, rows), total)
         residual, jacobian = total[:end].reshape(rows, size), tuple(total[end:].reshape(arity, rows, size, dof))
-        square = np.square(residual).sum(axis=1)
+        square = np.vecdot(residual, residual)
         if factor.loss is not None:
             root = np.sqrt(factor.loss.weight(square))[:, None]
             residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)

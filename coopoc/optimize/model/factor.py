@@ -8,14 +8,15 @@ from functools import cache, cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
+from numpy.linalg import cholesky, det, eigvalsh, inv, matrix_rank, norm
+from numpy.typing import ArrayLike
 
 from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of, refuse, remade
 from ...errors import InputError
 from .measurements import Measurement, lookup
 
 
-def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
+def whitening(kind: str, cov: ArrayLike) -> Floats:
     """W with W^T W = cov^-1 of covariances (..., size, size): the inverse of their Cholesky factor.
 
     Raises:
@@ -28,16 +29,16 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
     if array.ndim < 2 or array.shape[-1] != array.shape[-2]:
         raise InputError("cov", array.shape, "must be square matrices", "Give variances on the diagonal, m^2 or rad^2.")
     flat = array.reshape(-1, *array.shape[-2:])
-    mirrored = np.isclose(flat, np.swapaxes(flat, 1, 2), rtol=1e-6, atol=1e-300) & np.isfinite(flat)
+    mirrored = np.isclose(flat, flat.mT, rtol=1e-6, atol=1e-300) & np.isfinite(flat)
     least = np.full(len(flat), np.nan)
     symmetric = np.asarray(mirrored.all(axis=(1, 2)))
-    least[symmetric] = np.linalg.eigvalsh(flat[symmetric])[:, 0]
+    least[symmetric] = eigvalsh(flat[symmetric])[:, 0]
     if not (least > 0).all():
         k = int(np.flatnonzero(~(least > 0))[0])
         why = f"smallest eigenvalue {least[k]:.3g}" if symmetric[k] else "not symmetric or not finite"
         hint = "Give a covariance, not an information matrix, with no exact direction."
         raise InputError(f"cov of {kind}", f"number {k}: {why}", "must be symmetric positive definite", hint)
-    return np.linalg.inv(np.linalg.cholesky(array))
+    return inv(cholesky(array))
 
 
 @lru_cache(maxsize=256)
@@ -52,7 +53,7 @@ def fitting(measurement: Measurement, width: int) -> int | None:
     return fits[0] if len(fits) == 1 else None
 
 
-def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
+def check_nodes(measurement: Measurement, nodes: ArrayLike) -> Ints:
     """(M, arity) whole numbers, no node paired with itself."""
     array = checked("nodes", nodes, dtype=int)
     if array.ndim != 2 or array.shape[1] != measurement.arity:
@@ -66,7 +67,7 @@ def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
     return array
 
 
-def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
+def check_constants(measurement: Measurement, constants: ArrayLike | None, count: int) -> Floats:
     """(M, c) finite numbers, as many as the kind has."""
     values = checked(f"constants of {measurement.name}", [] if constants is None else constants)
     fits = (
@@ -82,7 +83,7 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
     return frozen(np.full((count, measurement.constants), values))
 
 
-def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
+def check_values(measurement: Measurement, z: ArrayLike, count: int) -> Floats:
     """z as (M, k): finite, distances > 0, angles in radians, rotations that are some."""
     field = f"z of {measurement.name}"
     array = checked(field, z)
@@ -102,21 +103,21 @@ def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floa
             refuse(field, column, column <= 0, "must be a distance > 0 m", hint)
         if component == "angle":
             hint = "This looks like degrees: use np.deg2rad."
-            refuse(field, column, np.abs(column) > 2 * np.pi, "must be within 2 pi rad", hint)
+            refuse(field, column, abs(column) > 2 * np.pi, "must be within 2 pi rad", hint)
     return array
 
 
 def check_rotations(field: str, rotation: Floats) -> None:
     """InputError unless matrices (..., d, d) are rotations."""
-    error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(rotation.shape[-1])).max(axis=(-1, -2))
-    if (error > 1e-6).any() or (np.linalg.det(rotation) < 0).any():
+    error = abs(rotation @ rotation.mT - np.eye(rotation.shape[-1])).max(axis=(-1, -2))
+    if (error > 1e-6).any() or (det(rotation) < 0).any():
         hint = "Make it with coopoc.optimize.pose(position, angle)."
         if (rotation == 0).all(axis=(-2, -1)).any():
             hint = "Zeros are none: points and anchors among poses need a rotation, too: co.pose(anchor, 0)."
         raise InputError(field, f"a rotation off by {error.max():.1g}", "must hold rotation matrices", hint)
 
 
-def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple[int, int]) -> Floats:
+def check_std(measurement: Measurement, std: ArrayLike | float, shape: tuple[int, int]) -> Floats:
     """std as (M or 1, size): > 0, angles at most pi."""
     field, size = f"std of {measurement.name}", shape[-1]
     array = checked(field, std)
@@ -131,7 +132,7 @@ def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple
     return frozen(wide)
 
 
-def check_root(measurement: Measurement, root: npt.ArrayLike, shape: tuple[int, int]) -> Floats:
+def check_root(measurement: Measurement, root: ArrayLike, shape: tuple[int, int]) -> Floats:
     """sqrt_information as (M or 1, size, size), finite."""
     array, size = checked("sqrt_information", root), shape[-1]
     array = array[None] if array.ndim == 2 else array
@@ -151,7 +152,7 @@ LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, floa
     ),
     "cauchy": (lambda s, c, m: c * c * m.log1p(s / (c * c)), lambda s, c: 1.0 / (1.0 + s / (c * c))),
     "geman-mcclure": (lambda s, c, m: s / (1.0 + s / (c * c)), lambda s, c: (1.0 + s / (c * c)) ** -2.0),
-    "truncated": (lambda s, c, m: m.where(s > c * c, c * c, s), lambda s, c: (s <= c * c).astype(np.float64)),
+    "truncated": (lambda s, c, m: m.where(s > c * c, c * c, s), lambda s, c: (s <= c * c).astype(float)),
 }
 """rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
 
@@ -188,11 +189,11 @@ class Loss:
         """True if the loss adds no minima to those of least squares."""
         return self.name == "huber"
 
-    def cost(self, square: npt.ArrayLike) -> Floats:
+    def cost(self, square: ArrayLike) -> Floats:
         """rho(s)."""
         return np.asarray(LOSSES[self.name][0](checked("square", square), self.scale, np))
 
-    def weight(self, square: npt.ArrayLike) -> Floats:
+    def weight(self, square: ArrayLike) -> Floats:
         """rho'(s), in [0, 1]."""
         return LOSSES[self.name][1](checked("square", square), self.scale)
 
@@ -229,11 +230,11 @@ class Factor:
     constants: Floats | None = None
     loss: Loss | None = None
     twice: bool = False
-    cov: InitVar[npt.ArrayLike | None] = None
+    cov: InitVar[ArrayLike | None] = None
 
     __reduce__ = remade
 
-    def __post_init__(self, cov: npt.ArrayLike | None) -> None:
+    def __post_init__(self, cov: ArrayLike | None) -> None:
         measurement = _checked(self)
         self.__dict__["z"] = check_values(measurement, self.z, len(self.nodes))
         noise = {"std": self.std, "sqrt_information": self.sqrt_information, "cov": cov}
@@ -277,12 +278,12 @@ class Factor:
         if self.std is not None:
             return np.full(len(self.nodes), np.isfinite(self.std).sum(axis=1))
         root, rank = self.root, np.full(len(self.nodes), self.size)
-        flat = ~(np.abs(np.linalg.det(root)) > DEPENDENT_VOLUME * np.linalg.norm(root, axis=2).prod(axis=1))
+        flat = ~(abs(det(root)) > DEPENDENT_VOLUME * norm(root, axis=2).prod(axis=1))
         if flat.any():  # the rank takes as long as many steps of a solve
-            rank[flat] = np.linalg.matrix_rank(root[flat])
+            rank[flat] = matrix_rank(root[flat])
         return rank
 
-    @property
+    @cached_property
     def root(self) -> Floats:
         """W as (M, size, size)."""
         root = self.sqrt_information if self.std is None else np.eye(self.size) / self.std[:, None]
@@ -317,7 +318,7 @@ def stacked(arrays: Iterable[AnyArray], *width: int) -> AnyArray:
     >>> stacked([], 2).shape
     (0, 2)
     """
-    return np.concatenate([*arrays] or [np.empty((0, *width), np.int64)])
+    return np.concatenate([*arrays] or [np.empty((0, *width), int)])
 
 
 @cache

@@ -8,7 +8,7 @@ from itertools import compress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade
 from ...errors import InputError, shown, suggestion
@@ -128,7 +128,7 @@ class Problem:
     @cached_property
     def movable(self) -> Bools:
         """(n, dof) False where a node cannot move: it is fixed, or a point that has no rotation."""
-        movable = np.ones((len(self.names), self.space.dof), dtype=bool)
+        movable = np.ones((len(self.names), self.space.dof), bool)
         if self.poses:
             movable[np.setdiff1d(np.arange(len(movable)), self.poses), self.dimension :] = False
         movable[list(self.fixed)] = False
@@ -155,12 +155,12 @@ class Problem:
         self,
         kind: str,
         nodes: Nodes,
-        z: npt.ArrayLike,
-        std: npt.ArrayLike | None = None,
+        z: ArrayLike,
+        std: ArrayLike | None = None,
         *,
-        cov: npt.ArrayLike | None = None,
-        sqrt_information: npt.ArrayLike | None = None,
-        constants: npt.ArrayLike | None = None,
+        cov: ArrayLike | None = None,
+        sqrt_information: ArrayLike | None = None,
+        constants: ArrayLike | None = None,
         loss: "Loss | None" = None,
     ) -> "Problem":
         """The problem with one more measurement, or with M of one kind; the arguments are those of Factor.
@@ -188,9 +188,9 @@ class Problem:
         self,
         kind: str,
         nodes: Nodes,
-        lower: npt.ArrayLike = -np.inf,
-        upper: npt.ArrayLike = np.inf,
-        constants: npt.ArrayLike | None = None,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+        constants: ArrayLike | None = None,
     ) -> "Problem":
         """The problem with lower <= h(x) <= upper for the kind's formula h; the arguments are those of Constraint.
 
@@ -233,11 +233,11 @@ class Problem:
         """The problem from another x0 (n, ambient), which need not be checked."""
         return self.replace_unchecked(x0=frozen(x0))
 
-    def linearise(self, x: npt.ArrayLike) -> Linear:
+    def linearise(self, x: ArrayLike) -> Linear:
         """Whitened residuals and derivatives at x (n, ambient)."""
         return linearise(self.space, self.factors, self.movable, self._at(x))
 
-    def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
+    def whiten(self, x: ArrayLike) -> tuple[Floats, Any]:
         """Residual r (rows,) and sparse Jacobian J (rows, n dof) at x (n, ambient): cost = 1/2 r.r.
 
         A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
@@ -245,11 +245,11 @@ class Problem:
         linear, J = linearised(self, self._at(x))
         return stacked(r.ravel() for r in linear.residual), J
 
-    def cost(self, x: npt.ArrayLike) -> float:
+    def cost(self, x: ArrayLike) -> float:
         """1/2 sum of rho at x (n, ambient)."""
         return self.linearise(x).cost
 
-    def _at(self, x: npt.ArrayLike) -> Floats:
+    def _at(self, x: ArrayLike) -> Floats:
         return points(self.space, len(self.names), "x", x)
 
     @classmethod
@@ -319,7 +319,7 @@ def several(nodes: Any) -> list[Any]:
     return [nodes] if scalar or isinstance(nodes, str) or not isinstance(nodes, Iterable) else list(nodes)
 
 
-def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
+def rows(kind: str, z: ArrayLike, count: int) -> Floats:
     """z (count, size) from a number, a row or rows."""
     values = checked(f"z of {kind}", z)
     return values.reshape(count, -1) if values.ndim < 2 and values.size % count == 0 else values
@@ -381,7 +381,7 @@ def restricted(problem: Problem, used: Bools, x: Floats, rows: Sequence[Ints]) -
     return problem.replace_unchecked(**changes, x0=frozen(x[used]), shown=0)
 
 
-def points(space: Space, n: int, field: str, x: npt.ArrayLike) -> Floats:
+def points(space: Space, n: int, field: str, x: ArrayLike) -> Floats:
     """x as an array (n, ambient); InputError if it is not one, or holds matrices of no rotation."""
     array = checked(field, x)
     if array.shape != (n, space.ambient) or not np.isfinite(array).all():

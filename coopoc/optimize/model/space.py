@@ -60,8 +60,8 @@ class Space:
     def join(self, position: Floats, rotation: Floats | None = None) -> Floats:
         """Nodes (..., ambient) from positions (..., d) and rotations (..., d, d), default the identity."""
         if not self.has_rotation:
-            return np.asarray(position, dtype=np.float64)
-        turned = np.eye(self.dimension) if rotation is None else np.asarray(rotation, dtype=np.float64)
+            return np.asarray(position, float)
+        turned = np.eye(self.dimension) if rotation is None else np.asarray(rotation, float)
         flat = turned.reshape(*turned.shape[:-2], self.dimension**2)
         return np.concatenate([position, np.broadcast_to(flat, (*np.shape(position)[:-1], flat.shape[-1]))], axis=-1)
 
@@ -135,7 +135,7 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     array([ 1.,  2.,  0., -1.,  1.,  0.])
     """
     at, w = checked("position", position), checked("turn", turn)
-    refuse("turn", w, ~(np.abs(w) <= MAX_ANGLE), "must be finite, at most 10^6 rad", "Give rad.")
+    refuse("turn", w, ~(abs(w) <= MAX_ANGLE), "must be finite, at most 10^6 rad", "Give rad.")
     check_turns("turn", w)
     if not at.ndim or at.shape[-1] not in (2, 3):
         allowed = "must have shape (..., 2) or (..., 3)"

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ...arrays import Floats, instance, one_of
 from ...kernels.compiling.waiting import clock
@@ -17,17 +17,20 @@ from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
 from ..starts.initial import initial_guess
-from .graduated import LAST_MU, Candidates, Graduation, bounds, contest, graduate, mark
+from .graduated import LAST_MU, Candidates, Graduation, bounds, contest, from_convex, graduate, mark
 from .loop_closures import known_start, unconfirmed
 
 Start = Literal["any", "known"]
+CONTEST_NODES, RIVAL_STEPS = 1000, 100
+"""Nodes beyond which, where candidates are relative poses or linear, the graduation alone competes with known inliers,
+and steps of each of its least squares: the first ones bend a long drive."""
 
 
 def solve_gnc(
     problem: Problem,
     candidates: Candidates,
     threshold: float = 0.99,
-    groups: npt.ArrayLike | None = None,
+    groups: ArrayLike | None = None,
     backend: str | Backend = "gauss-newton",
     throw: bool = True,
     start: Start = "any",
@@ -47,7 +50,8 @@ def solve_gnc(
     Where known inliers hold every node, as odometry does, they are the start, which candidates join where they are
     predicted (`loop_closures.py`): a first least squares over wrong loop closures would bend a long drive. The
     graduation and other starts (`graduated.py`) race with that, and the least cost wins, unless every candidate is a
-    relative pose or linear, and the noise explains what remains of them.
+    relative pose or linear, and the noise explains what remains of them. Of more than CONTEST_NODES the graduation
+    alone does, until its surrogate costs more.
 
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
@@ -57,8 +61,8 @@ def solve_gnc(
             each on its own.
         backend: of `solve`, for the last problem, and with constraints for every round.
         throw: as in `solve`.
-        start: "known" lets nothing compete with known inliers that hold every node: that takes minutes for thousands of
-            poses whose noise is stated too small.
+        start: "known" lets nothing compete with known inliers that hold every node: that takes several times as long
+            for thousands of poses whose noise is stated too small.
         options: of the backend.
 
     Returns:
@@ -86,12 +90,12 @@ def solve_gnc(
     marked = replace(marked, bound=bounds(marked, threshold))
     each, began, doubts = list[int](), clock(), tuple[str, ...]()
 
-    def inner(part: Problem) -> Floats:
+    def inner(part: Problem, steps: int = MAX_ITERATIONS) -> Floats:
         end: Solution | Arrival
         if problem.constraints:
             end = solve(part, backend, throw=False, covariance=False, **options)
         else:
-            end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, SOLVER_STEP_TOLERANCE)
+            end = arrive(sparse(part), np.array(part.x0), steps, SOLVER_STEP_TOLERANCE)
         each.append(end.iterations)
         return end.x
 
@@ -100,19 +104,25 @@ def solve_gnc(
 
     def explained(end: Graduation) -> bool:  # the minimum of ranges and angles need not be the only one
         part = marked.reweigh(end.weight, end.x)
-        single = all(m.linear or m.compares_poses for m in {problem.factors[k].measurement for k in marked.factor})
         return single and not implausible(sparse(part).cost(end.x), *expected(part, sparse(part).size))
 
     def cost(at: Floats) -> float:
         s = marked.squares(at) / marked.bound
         return sparse(marked.reweigh(0.0 * s, at)).cost(at) + 0.5 * float(marked.bound @ np.minimum(s, 1.0))
 
+    single = all(m.linear or m.compares_poses for m in {problem.factors[k].measurement for k in marked.factor})
     known = known_start(marked, inner)
     best, end = "known", finish(*known) if known else None
     if end is None or (start == "any" and not explained(end)):
-        best, x, graduation, doubts = contest(marked, inner, initial_guess(problem), lambda at: finish(at).x, cost)
-        other = graduation if best == "graduated" else finish(x)
-        best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
+        least, guess = cost(end.x) if end else np.inf, initial_guess(problem)
+        if end and single and len(problem.names) > CONTEST_NODES:
+            best, other = "graduated", from_convex(marked, lambda part: inner(part, RIVAL_STEPS), guess, least)
+        else:
+            best, x, graduation, doubts = contest(marked, inner, guess, lambda at: finish(at).x, cost)
+            other = graduation if best == "graduated" else finish(x)
+        if end and (least <= cost(other.x) or not other.settled):
+            best, other = "known", end
+        end = other
     weight = end.weight
     final = solve(marked.reweigh(weight, end.x), backend, throw=throw and end.settled, **options)
     status = final.status if end.settled else Status.MAX_ITERATIONS

@@ -8,7 +8,8 @@ from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy import inf
+from numpy.typing import ArrayLike
 
 from ...arrays import TINY, AnyArray, Floats, Ints, checked, frozen, number, plain
 from ...errors import InputError, shown
@@ -47,7 +48,7 @@ class Marked:
 
     def sums(self, values: Floats) -> Floats:
         """(G,) sums over each group of values (M,)."""
-        return np.asarray(np.bincount(self.group, values, len(self.bound)), np.float64)
+        return np.asarray(np.bincount(self.group, values, len(self.bound)), float)
 
     def collected(self, of: Callable[[Factor], AnyArray]) -> Floats:
         """(G,) sums over each group of what there is of each measurement of a factor."""
@@ -71,7 +72,7 @@ class Marked:
         return self.problem.replace_unchecked(factors=tuple(factors), x0=frozen(x0))
 
 
-def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
+def mark(problem: Problem, candidates: Candidates, groups: ArrayLike | None = None) -> Marked:
     """The problem with its candidates, checked; their bounds are yet to be given."""
     places = []
     for item in candidates if isinstance(candidates, Sequence) else [candidates]:
@@ -126,6 +127,8 @@ measurements, as good as those that it rejects."""
 AGREEING_DRAWS, RIVAL_DISTANCE, PATH_SHARE = 6, 0.05, 0.8
 """Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
 elsewhere, and that of the ranges whose shortest paths make a start."""
+HOPELESS = 1.1
+"""Times a cost that another start has reached, beyond which a surrogate whose minimum is not yet reached ends."""
 GAINED = 1e-3
 """Share of the cost that another round must save."""
 
@@ -149,16 +152,34 @@ class Graduation(NamedTuple):
     settled: bool
 
 
-def graduate(marked: Marked, inner: Inner, x: Floats, mu: float, weight: Floats | None = None) -> Graduation:
+def graduate(
+    marked: Marked, inner: Inner, x: Floats, mu: float, weight: Floats | None = None, most: float = inf
+) -> Graduation:
     """Alternate `inner`, which solves a weighted problem, and weights, from x (n, ambient), mu and weight (G,),
-    default ones, until all are 0 or 1."""
-    weight = np.ones(len(marked.bound)) if weight is None else weight
+    default ones, until all are 0 or 1, or the cost is further above `most` than it fell in a round: that of the
+    surrogate, 1/2 sum_g c^2 (w s + mu (1 - w) / (mu + w)), which grows with mu along its minima, to that of the loss.
+
+    References:
+        Black, Rangarajan, On the unification of line processes, outlier rejection, and robust statistics, IJCV 1996.
+    """
+    weight, cost = np.ones(len(marked.bound)) if weight is None else weight, inf
     for _ in range(MAX_ROUNDS):
         before, weight = weight, weights(marked.squares(x) / marked.bound, mu)
         if ((weight == before) & ((weight == 0.0) | (weight == 1.0))).all():
             return Graduation(x, weight, True)
-        x, mu = inner(marked.reweigh(weight, x)), mu * MU_RATE
+        part = marked.reweigh(weight, x)
+        x, last = inner(part), cost
+        cost = sparse(part).cost(x) + 0.5 * float(marked.bound @ (mu * (1.0 - weight) / (mu + weight)))
+        if cost > HOPELESS * most and cost - most > last - cost:
+            break
+        mu *= MU_RATE
     return Graduation(x, weight, False)
+
+
+def from_convex(marked: Marked, inner: Inner, start: Floats, most: float = inf) -> Graduation:
+    """The graduation of all from a start (n, ambient) and a convex surrogate, until that costs more than `most`."""
+    x = inner(marked.problem.starting_at(start))
+    return graduate(marked, inner, x, first_mu(float((marked.squares(x) / marked.bound).max())), most=most)
 
 
 def contest(
@@ -177,8 +198,7 @@ def contest(
         finish: from where a start leads to a minimum of the cost.
         cost: that is to be least.
     """
-    x = inner(marked.problem.starting_at(start))
-    graduation = graduate(marked, inner, x, first_mu(float((marked.squares(x) / marked.bound).max())))
+    graduation = from_convex(marked, inner, start)
     huber, cauchy, truncated = (softened(marked, name) for name in ("huber", "cauchy", "truncated"))
 
     with progress("robust") as counted:
@@ -194,7 +214,7 @@ def contest(
         starts = {"graduated": graduation.x, "x0": start, "cauchy": soft(start)}
         starts["huber"] = soft(inner(huber.starting_at(start)))
         ends = {name: landed(at) for name, at in starts.items()}
-        costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
+        costs = {name: np.nan_to_num(cost(at), nan=inf) for name, at in ends.items()}
         best = min(ends, key=costs.__getitem__)
         if bool((graduation.weight == 1.0).all()) and not higher(costs["graduated"], costs[best]):
             return "graduated", ends["graduated"], graduation, ()
@@ -204,9 +224,9 @@ def contest(
         best_x, tried = drawn(places, mirrored_x, lambda at: landed(soft(at)), cost, AGREEING_DRAWS)
         d, (lowest, _) = cauchy.dimension, min(tried, key=lambda end: end[0])
         size = RIVAL_DISTANCE * np.ptp(np.concatenate([y[:, :d] for _, y in tried]), axis=0).max()
-        notes = doubts(best_x, [end for end in tried if np.abs(end[1] - best_x)[:, :d].max() > size], cost)
+        notes = doubts(best_x, [end for end in tried if abs(end[1] - best_x)[:, :d].max() > size], cost)
         notes = *notes, *reached_once([each for each, _ in tried], lowest)
-        name, least = best if best_x is mirrored_x else "drawn", np.inf
+        name, least = best if best_x is mirrored_x else "drawn", inf
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)
             if len(loose):

@@ -38,7 +38,7 @@ def known_start(marked: Marked, inner: Inner) -> tuple[Floats, Floats] | None:
         gate of a predicted measurement. Olson, Agarwal, IJRR 2013, on graphs.
     """
     problem, bound = marked.problem, marked.bound
-    weight, left = np.zeros(len(bound)), np.zeros(len(bound), dtype=np.int64)
+    weight, left = np.zeros(len(bound)), np.zeros(len(bound), int)
     x = along_poses(marked.reweigh(weight, initial_guess(problem)))
     if len(_free(marked, weight)[1]):
         return None
@@ -70,7 +70,7 @@ def _free(marked: Marked, weight: Floats) -> tuple[Ints, Ints]:
     factors = marked.reweigh(weight, initial_guess(problem)).factors
     measured = [factor.nodes[factor.informative] for factor in factors]
     part, alone = parts(len(problem.names), *measured), [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
-    held: Ints = np.concatenate([problem.fixed, *alone]).astype(np.int64)
+    held: Ints = np.concatenate([problem.fixed, *alone]).astype(int)
     return part, np.flatnonzero(~np.isin(part, part[held]))
 
 
@@ -124,7 +124,7 @@ def predicted(marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats
         free, *pairs = pairs_of(system.entries.number[factor.nodes].reshape(len(J), -1))
         P = np.zeros(free.shape)
         P[free] = system.cholesky.inverse(*pairs)
-        S = J @ P @ np.swapaxes(J, 1, 2) + np.eye(factor.size)
+        S = J @ P @ J.mT + np.eye(factor.size)
         lost |= ~np.isfinite(S).all(axis=(1, 2))
         variance, axes = np.linalg.eigh(np.where(lost[:, None, None], np.eye(factor.size), S))
         variance = np.maximum(variance, 1.0)  # as it is but for rounding, of nodes that are nearly free

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.linalg import norm, pinv, svd
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
@@ -43,7 +44,7 @@ def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools
 
     edges, n, d = graph.relative_pose, len(graph.names), graph.dimension
     position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
-    is_reached = np.zeros(n, dtype=bool)
+    is_reached = np.zeros(n, bool)
     length, rows = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12, np.flatnonzero(used)
     which = rows[np.argsort(length[rows], kind="stable")]
     ends = np.stack([edges.nodes[which], edges.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
@@ -55,10 +56,10 @@ def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools
             continue
         distance, before = dijkstra(lengths, indices=root, return_predecessors=True)
         reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
-        before = before.astype(np.int64)  # SciPy's 32 bits hold no product of two numbers beyond 46,340
+        before = before.astype(int)  # SciPy's 32 bits hold no product of two numbers beyond 46,340
         taken = np.searchsorted(key, before[reached] * n + reached)
         moved, turn = edges.position[edge[taken]], edges.rotation[edge[taken]]
-        back = np.swapaxes(turn, 1, 2)
+        back = turn.mT
         turn = np.where(forward[taken, None, None], turn, back)
         moved = np.where(forward[taken, None], moved, -(back @ moved[..., None])[..., 0])
         index = np.full(n, -1)
@@ -96,14 +97,17 @@ def crossings(places: Floats, ranges: Floats) -> Floats:
     array([[ 4., -3.],
            [ 4.,  3.]])
     """
-    d, few = places.shape[1], np.unique(np.linspace(0, len(places) - 1, CUT_SPHERES).round().astype(np.int64))
+    d, few = places.shape[1], np.unique(np.linspace(0, len(places) - 1, CUT_SPHERES).round().astype(int))
     chosen = np.array([*combinations(few, d)])
     p, r = places[chosen], ranges[chosen]
     gap = p[:, 1:] - p[:, :1]
     right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
-    foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
-    height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
-    up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
+    way, far = gap[:, 0], np.maximum(norm(gap[:, 0], axis=1, keepdims=True), 1e-99)
+    if d == 2:  # in a tenth of the time
+        foot, off = way / far * right / far, way[:, ::-1] / far * [-1, 1]
+    else:
+        foot, off = (pinv(gap) @ right[..., None])[..., 0], svd(gap)[2][:, -1]
+    up = off * np.sqrt(np.maximum(np.square(r[:, :1]) - np.vecdot(foot, foot)[:, None], 0.0))
     return np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d)
 
 
@@ -120,8 +124,8 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
     if len(places) < places.shape[1]:
         return np.asarray(places[0] + ranges[0] * np.eye(places.shape[1])[0])
     met = crossings(places, ranges)
-    off = np.linalg.norm(met[:, None] - places, axis=2) - ranges
-    return np.asarray(met[np.square(off).sum(axis=1).argmin()])
+    off = norm(met[:, None] - places, axis=2) - ranges
+    return np.asarray(met[np.vecdot(off, off).argmin()])
 
 
 def chained(graph: Graph) -> Floats:
@@ -135,14 +139,14 @@ def tree(graph: Graph) -> Floats:
     between robots too, their rotations then averaged, in space `relaxed`, and with these all positions averaged; what
     it does not join hangs on as in `chained`."""
     edges, roots, d = graph.relative_pose, _roots(graph), graph.dimension
-    position, rotation, reached = walk(graph, np.ones(len(edges), dtype=bool), roots)
+    position, rotation, reached = walk(graph, np.ones(len(edges), bool), roots)
     held = [root for root, _, _ in roots]
     (i, j), variance = edges.nodes.T, rotation_variance(edges, d)
     if len(edges) and d == 3:
         rotation = relaxed(graph, rotation, held)
     elif len(edges):  # angles add, so that one solve is exact
         turns, _ = averaging(edges.nodes, variance, len(rotation), held)
-        rotation = exp(turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))) @ rotation
+        rotation = exp(turns(log(rotation[j] @ (rotation[i] @ edges.rotation).mT))) @ rotation
     space, kinds = Space(d, has_rotation=True), (edges, graph.relative_point)
     at = space.position(with_points(graph, position, rotation, reached))
     (i, j), moved = np.concatenate([each.nodes for each in kinds]).T, np.concatenate([each.position for each in kinds])
@@ -166,7 +170,7 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
 
     edges, (n, d, _) = graph.relative_pose, rotation.shape
     weight = 1.0 / np.sqrt(rotation_variance(edges, d))
-    back, ones = -np.swapaxes(edges.rotation, 1, 2), np.broadcast_to(np.eye(d), edges.rotation.shape)
+    back, ones = -edges.rotation.mT, np.broadcast_to(np.eye(d), edges.rotation.shape)
     blocks = weight[:, None, None, None] * np.stack([back, ones], axis=1)
     gaps = bsr_array(
         (blocks.reshape(-1, d, d), edges.nodes.ravel(), 2 * np.arange(len(edges) + 1)), shape=(len(edges) * d, n * d)
@@ -176,11 +180,11 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
     for _ in range(SWEEPS):
         if factored is None:
             return rotation
-        matrices = columns_solved(factored, far * np.swapaxes(turned, 1, 2).reshape(n * d, d)).reshape(n, d, d)
-        turned = nearest_rotation(np.swapaxes(matrices, 1, 2))
+        matrices = columns_solved(factored, far * turned.mT.reshape(n * d, d)).reshape(n, d, d)
+        turned = nearest_rotation(matrices.mT)
     part = parts(n, edges.nodes)
     still = firsts(part, held)[part]
-    return rotation[still] @ np.swapaxes(turned[still], 1, 2) @ turned
+    return rotation[still] @ turned[still].mT @ turned
 
 
 def firsts(part: Ints, held: Sequence[int]) -> Ints:
@@ -314,17 +318,17 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     """
     assert problem.x0 is not None
     space, x, n = problem.space, problem.x0.copy(), len(graph.names)
-    solved, ranges, iterations, whole = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64), 0, 0
+    solved, ranges, iterations, whole = np.zeros(n, bool), np.zeros(n, int), 0, 0
     last, count = solved, _stages(graph)
     for stage in range(count):
-        used = np.zeros(n, dtype=bool)
+        used = np.zeros(n, bool)
         for places in graph.robots.values():
             new = places[: int(np.ceil((stage + 1) / count * len(places)))]
             used[new] = True
             old = new[solved[new]]
             if len(old) and len(old) < len(places):
                 x[places[len(old) :]] = carried(space, problem.x0[places[len(old) :]], problem.x0[old[-1]], x[old[-1]])
-        joins = np.zeros(n, dtype=bool)
+        joins = np.zeros(n, bool)
         for edges in (graph.relative_point, graph.point_prior):
             joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
         for point in np.flatnonzero(~graph.is_pose & ~joins).tolist():

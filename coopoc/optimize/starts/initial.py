@@ -130,7 +130,7 @@ def along_poses(problem: Problem) -> Floats:
     """
     graph, space, x = graph_of(problem), problem.space, initial_guess(problem)
     roots = [(k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses)]
-    position, rotation, placed = walk(graph, np.ones(len(graph.relative_pose), dtype=bool), roots)
+    position, rotation, placed = walk(graph, np.ones(len(graph.relative_pose), bool), roots)
     position[~placed], rotation[~placed] = space.position(x[~placed]), space.rotation(x[~placed])
     return with_points(graph, position, rotation, placed)[:, : space.ambient]
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy import inf, pi
 
 from ...arrays import Floats, Ints
 from ..algebra.sparse import Sparse, sparse
@@ -13,7 +14,7 @@ from ..model.problem import Problem, Search
 from ..model.space import exp
 from .graph_starts import parts
 from .initial import directed, joining
-from .mirrors import RANGES, Cost, Descend, across, rewound
+from .mirrors import RANGES, RIVAL_COST, Cost, Descend, across, rewound
 
 FIRST_STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -25,8 +26,6 @@ RACE_TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
 EXCESS_STDS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
-RIVAL_COST = 10.0
-"""Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
 DRAWS, QUIET_DRAWS, AGREEING_DRAWS, DRAWN_POINTS = 90, 30, 20, 1800
 """Random starts at most, with constraints or losses, that lead to the lowest minimum and end them, and points together.
 """
@@ -64,12 +63,9 @@ def race(
     """
     system, taken, arrived = sparse(problem), 0, True
     cost_of = system.cost
-    tried = {} if reached is None else {"x0": (cost_of(reached), reached)}
+    tried = dict[str, tuple[float, Floats]]()
     straight, late = set(), dict(late)
     rough, calm, minima = list[str](), list[float](), list[float]()
-    mean, variance = expected(problem, system.size)
-    usual = EXCESS_STDS * np.sqrt(variance)
-    limit = mean + usual
 
     def descend(x: Floats, steps: int = 50) -> Floats:
         nonlocal taken, arrived
@@ -106,13 +102,22 @@ def race(
             x = descend(x, LATER_STEPS)
             y, ends = drawn(scattered(problem, x), x, landed, cost_of)
             name, x = (name if y is x else "drawn"), y
-        x, moves, others = across(problem, x, landed, cost_of)
+        x, moves, others = across(problem, x, landed, cost_of, not starts)
+        if not (taken or starts):
+            return problem, Search(name)
         name, cost = name + ", moved" * (moves > 0), cost_of(x)
         costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
         ends += [*others, *((each, x) for each in minima)]
         notes = doubts(x, ends, cost_of) or (() if sure else reached_once(costs, cost))
         return problem.starting_at(x), Search(name, taken, notes=notes)
 
+    if reached is not None:
+        if not starts:
+            return ended("x0", reached)
+        tried["x0"] = cost_of(reached), reached
+    mean, variance = expected(problem, system.size)
+    usual = EXCESS_STDS * np.sqrt(variance)
+    limit = mean + usual
     relative = all(f.measurement.compares_poses for f in problem.factors)
     relative = relative and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
     for name, start in starts.items():
@@ -164,13 +169,13 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
     normal = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][-1]
     part = parts(n, *joining(problem))
     poses = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
-    held = np.concatenate([np.array(problem.fixed, np.int64), *poses])
+    held = np.concatenate([np.array(problem.fixed, int), *poses])
     free = np.setdiff1d(part if loose is None else part[loose], part[held])
     for k in range(min(DRAWS, DRAWN_POINTS // n) if len(free) else 0):
         y = x.copy()
         for body in rng.choice(free, 1) if k % 4 == 2 else free:
             own = np.flatnonzero(part == body)
-            turn = exp(rng.uniform(-np.pi, np.pi, 1)) if d == 2 else Rotation.random(random_state=rng).as_matrix()
+            turn = exp(rng.uniform(-pi, pi, 1)) if d == 2 else Rotation.random(random_state=rng).as_matrix()
             middle, move, alone = at[own].mean(axis=0), spread * rng.normal(size=d), len(own) == 1
             to = (center if alone else middle) + move * (k % 4 > 0 or alone)
             to = middle + normal * (move @ normal) if k % 4 == 3 else to
@@ -201,7 +206,7 @@ def smooth(record: Floats) -> bool:
     """Whether the gain ratio of every step of an Arrival was within 1/2 .. 3/2, without damping. An exact Hessian that
     was not positive definite does not count: J^T J goes on from there."""
     _, damping, gain = record.T
-    return bool(not damping.any() and (np.abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
+    return bool(not damping.any() and (abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
 
 
 def drawn(
@@ -209,13 +214,13 @@ def drawn(
 ) -> tuple[Floats, list[tuple[float, Floats]]]:
     """The lowest end (n, ambient) of x and of descents from other places, until `agreeing` lead to the lowest; and all
     ends with their costs, x first."""
-    best, least = x, float(np.nan_to_num(cost(x), nan=np.inf))
+    best, least = x, float(np.nan_to_num(cost(x), nan=inf))
     ends = [(least, x)]
     for y in places:
         if sum(not higher(each, least) for each, _ in ends) >= agreeing:
             break
         y = descend(y)
-        now = float(np.nan_to_num(cost(y), nan=np.inf))
+        now = float(np.nan_to_num(cost(y), nan=inf))
         ends.append((now, y))
         best, least = (y, now) if higher(least, now) else (best, least)
     return best, ends
@@ -223,10 +228,12 @@ def drawn(
 
 def doubts(x: Floats, ends: Iterable[tuple[float, Floats]], cost: Cost) -> tuple[str, ...]:
     """Notes on other ends, with their costs, than the minimum x: one elsewhere costs as much, or one little more."""
-    least, ends = cost(x), [*ends]
+    if not (ends := [*ends]):
+        return ()
+    least = cost(x)
     near = [each - least for each, _ in ends if higher(each, least) and each < least + RIVAL_COST]
     notes = (f"another minimum costs {min(near):.3g} more: noise may decide between them",) if near else ()
-    alike = [y for each, y in ends if not higher(each, least) and np.abs(y - x).max() > SAME_COST * np.abs(x).max()]
+    alike = [y for each, y in ends if not higher(each, least) and abs(y - x).max() > SAME_COST * abs(x).max()]
     elsewhere = any(cost(0.5 * (x + y)) > least + BARRIER for y in alike)
     return (ELSEWHERE, *notes) if elsewhere else notes
 
