@@ -323,5 +323,5 @@ def check_fields(made: Any, limits: Limits | None = None) -> None:
         elif not all(isinstance(one, type) and not getattr(one, "_is_protocol", False) for one in kinds):
             continue
         elif not isinstance(value, (*kinds, np.bool_) if kind is bool else kinds):
-            text = " | ".join(one.__name__ for one in kinds if one is not NoneType)
-            raise InputError(name, shown(value), f"must be {text}", hint)
+            allowed = f"must be {' | '.join(one.__name__ for one in kinds if one is not NoneType)}"
+            raise InputError(name, shown(value), allowed, hint)

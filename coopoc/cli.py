@@ -92,8 +92,8 @@ def run(
     for text in tables(folder):
         print(text, end="\n\n")
     for _, row in results.failures.head(5).iterrows():
-        params = ", ".join(f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
-        print(f"coopoc: failed: {row['reason']} ({params})", file=sys.stderr)
+        params = (f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
+        print(f"coopoc: failed: {row['reason']} ({', '.join(params)})", file=sys.stderr)
         print(textwrap.indent("\n".join(row["traceback"].splitlines()[-5:]), "  "), file=sys.stderr)
     if tracks == "tum":
         print(f"coopoc: estimates are in {write_tracks(name, out, changes)}", file=sys.stderr)

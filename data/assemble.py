@@ -8,6 +8,7 @@ from numpy import nan
 
 from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
+from coopoc.world.plausible import MAX_SPEED, plausible
 
 SAME_INSTANT = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
@@ -127,6 +128,7 @@ def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: s
         u[1:] = np.diff(position, axis=0) / np.diff(t)[:, None, None]
         starts = np.isfinite(position[:-1]) & ~np.isfinite(u[:-1])
         u[:-1][starts] = u[1:][starts]
+    plausible(f"{file}: velocity [step, vehicle, axis]", u, MAX_SPEED, "Do positions jump, as between zones of UTM?")
     alone = np.argwhere(np.isfinite(position[..., 0]) & ~np.isfinite(u[..., 0]))
     if len(alone):
         raise InputError(

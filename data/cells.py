@@ -27,7 +27,7 @@ WHOLE = re.compile(r"^(\d+)\.0$")
 MAX_COLUMNS = 5000
 """Most columns of a table."""
 USUAL_HEADERS = {
-    "vehicle": "vehicle observer robot car agent sender vehicle_id robot_id id name",
+    "vehicle": "vehicle observer robot car agent sender vehicle_id robot_id id name mmsi",
     "partner": "partner neighbour neighbor to target subject other anchor receiver landmark",
     "t": "t time timestamp stamp seconds datetime utc tow sow",
     "latitude": "latitude lat",
@@ -39,8 +39,11 @@ USUAL_HEADERS = {
     "heading": "heading yaw hdg",
     "x": "easting east",
     "y": "northing north",
+    "vx": "ve veast",
+    "vy": "vn vnorth",
 }
 """Words in headers that others give to the columns, in wide tables."""
+PLAIN = "must be a finite number as -1234.5, without a unit, separators of thousands or N, S, E, W"
 OTHER_MEANINGS = {"rate", "vertical", "acc", "accel", "accuracy", "std", "sigma", "error", "variance", "cov"}
 """Words beside which these mean something else."""
 
@@ -162,7 +165,7 @@ def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
         texts = cells.map(lambda cell: str(cell)[:300])
         values = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
-    _refuse(cells, ~(abs(values) <= MAX_NUMBER), file, "must be a finite number")
+    _refuse(cells, ~(abs(values) <= MAX_NUMBER), file, PLAIN)
     return values
 
 
@@ -243,14 +246,16 @@ def named_columns(
         if key not in allowed:
             raise unknown(f"{file}: key of columns", key, allowed, 'Give columns={"t": "name in the file"}.')
     renamed = frame.rename(columns={header: key for key, header in columns.items()})
-    for key in columns:
+    for key, header in columns.items():
         if (renamed.columns == key).sum() > 1:
             raise InputError(
                 f"{file}: columns[{key!r}]",
-                repr(columns[key]),
+                repr(header),
                 f"would be a second column {key}: the file has one of that name",
                 "Rename or remove one of them.",
             )
+        if header in frame:
+            renamed[key] = frame[header]  # which may stand for several
     for key in needed:
         header = columns.get(key, key)
         if header not in frame:

@@ -115,10 +115,11 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     except InputError as error:
         print(f"\ncheck: no filter follows it, no picture is drawn: {error}")
         return
-    against = f"a filter of each vehicle alone{', ' * bool(result.span)}{result.span}"
     for title, rows in (("Fixes", result.vehicles), ("Relative measurements", result.measurements)):
         if rows:
-            print(f"\n{title}: innovations against {against}")
+            print(
+                f"\n{title}: innovations against a filter of each vehicle alone{', ' * bool(result.span)}{result.span}"
+            )
             print(tabulate(rows, headers="keys", tablefmt="github", floatfmt=".3g"))
     print()
     for warning in result.warnings or ("nothing looks wrong",):

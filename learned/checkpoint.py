@@ -138,8 +138,8 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
         model = made(**card["net"])
         model.load_state_dict(tensors)
     except (TypeError, RuntimeError) as error:
-        why = " ".join(str(error).split())
-        raise InputError(f"checkpoint {path}: net", card["net"], f"does not fit ({why})", "Train it again.") from None
+        allowed = f"does not fit ({' '.join(str(error).split())})"
+        raise InputError(f"checkpoint {path}: net", card["net"], allowed, "Train it again.") from None
     size = sum(p.numel() for p in model.parameters())
     if history is not None and history.shape[1:] != (size,):
         raise InputError(f"checkpoint {path}: history", history.shape, f"must be (rows, {size})", "Train it again.")

@@ -131,10 +131,11 @@ def _logged(log: Log, span: str) -> Source:
         return Drive(under(recording, v2x, logged=log.messages), begin, truth, lasting, spread)
 
     def text() -> str:
-        read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
         where = "" if span == "throughout" else f" {span},"
-        noise = f"with the noise that it states{begun()[2]}; the first {{:.3g}} s are not scored."
-        return f"What {{}} holds ({read}),{where} {noise}"
+        return (
+            f"What {{}} holds ({', '.join(f'{number} {what}' for what, number in log.summary.read.items() if number)}),"
+            f"{where} with the noise that it states{begun()[2]}; the first {{:.3g}} s are not scored."
+        )
 
     posed = truth is not None and truth.heading is not None
     digests = {"log": digest(recording), "truth": truth.digest if truth else ""}

@@ -272,13 +272,15 @@ def _findings(results: Results) -> list[str]:
         together = of(k, 0)
         if not k or together is None or 0 not in alone:
             continue
-        each = ", ".join(f"with {counted(n, 'landmark')} {value:.3g} m" for n, value in alone.items())
-        texts.append(f"K = {k} without a landmark: {together:.3g} m; alone {each}.")
+        each = (f"with {counted(n, 'landmark')} {value:.3g} m" for n, value in alone.items())
+        texts.append(f"K = {k} without a landmark: {together:.3g} m; alone {', '.join(each)}.")
     nees = list(ran({(k, n): of(k, n, "nees") for k in ks for n in marks}).values())
     if nees:
-        text = f"Mean NEES of a pose (3 is consistent): {np.mean(nees):.1f} over {len(nees)} cells"
         doubt = " Units, axes or stated noise do not fit the drive: coopoc data check shows the residuals of each kind."
-        texts.append(f"{text}, {max(nees):.1f} at most.{doubt * (min(nees) > UNFIT)}")
+        texts.append(
+            f"Mean NEES of a pose (3 is consistent): {np.mean(nees):.1f} over {len(nees)} cells, {max(nees):.1f} at "
+            f"most.{doubt * (min(nees) > UNFIT)}"
+        )
     return texts
 
 

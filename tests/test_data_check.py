@@ -58,7 +58,15 @@ FAULTS: dict[str, tuple[Any, str]] = {
     "a mirrored velocity": (lambda f: f.assign(vy=-f["vy"]), "car0: axes look swapped or mirrored: .* at -?0 deg"),
     "a partner without a place": (
         lambda f: pd.concat([f, f[f["range"].notna()].assign(partner="anchor")]),
-        r"\d+% of what was logged is not used, mostly \d+ relative measurements of members without a position",
+        r"\d+% of what was logged is not used, mostly \d+ relative measurements of members without a position .anchor",
+    ),
+    "another time zone": (
+        lambda f: f.assign(t=f["t"] + 1800 * f.vehicle.eq("car1")),
+        "car1: it is there when no other vehicle is: do clocks or time zones differ",
+    ),
+    "another zone of UTM": (
+        lambda f: f.assign(x=f["x"] + 1e4 * (f.t > 90)),
+        r"car0: its fixes jump by 1e\+04 m at 90.6 s, and stay there",
     ),
     "another frame": (
         lambda f: f.assign(x=f["x"] + 4e6 * f["vehicle"].eq("car1")),

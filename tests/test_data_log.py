@@ -72,7 +72,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
     fleet = drive(1)
     origin = (48.14, 11.58, 520.0)
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, 0].T, *origin)
-    frame = pd.DataFrame({"time": fleet.t, "lat": lat, "lon": lon, "alt": h, "speed_kmh": 8 * 3.6, "yaw": 0.0})
+    frame = pd.DataFrame({"time": fleet.t, "lat": lat, "lon": lon, "alt": h, "speed_kmh": 8 * 3.6, "both": 3.0})
     course = np.degrees(np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]))
     frame["yaw"] = (90 - course) % 360
     write(frame, tmp_path / "car7.csv")
@@ -81,7 +81,11 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
     assert log.recording.ids == ("car7",)
     assert_allclose(log.recording.gnss[0, :, 0], fleet.position[:, 0], atol=1e-6)
     assert_allclose(log.recording.velocity[0, 5:, 0], fleet.velocity[5:, 0], atol=0.05)
+    far = str(read_log(tmp_path / "car7.csv", columns=names, origin=(48.14, 12.58, 0)).summary)
+    assert "fixes far from the origin, over 70 km, of car7" in far
+    names |= {"latitude_std": "both", "longitude_std": "both"}
     free = read_log(tmp_path / "car7.csv", columns=names)
+    assert {*free.recording.sensors.gnss_std[:2]} == {3}
     assert free.origin == pytest.approx((lat[0], lon[0], h[0]))
     assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
     assert read_log(tmp_path / "car7.csv", columns=names, ignore=["height"]).origin == (lat[0], lon[0], 0.0)

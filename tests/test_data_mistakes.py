@@ -51,7 +51,7 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "no column of time": (swap("t,vehicle", "time,vehicle"), {}, "log.csv: column t"),
     "a header twice": (swap("std", "value"), {}, "log.csv: header"),
     "an unknown kind": (swap("range", "dist"), {}, "row 5, column kind"),
-    "a word for a number": (swap(ROW3, "0.0,red,vx,,eight,0.1,"), {}, "row 3, column value"),
+    "separators of thousands, or a word": (swap(ROW3, '0.0,red,vx,,"1,234.5",0.1,'), {}, "row 3, column value"),
     "an empty value": (swap(ROW3, "0.0,red,vx,,,0.1,"), {}, "row 3, column value"),
     "a time of day without a date": (swap(ROW3, "12:00:01,red,vx,,8.0,0.1,"), {}, "row 3, column t"),
     "nanoseconds for seconds": (nanoseconds(GOOD), {}, "column t"),
@@ -84,6 +84,7 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
     "steps longer than the log": (GOOD, {"dt": 5.0}, "dt"),
     "one instant": ("t,vehicle,x,y\n3,red,0,0\n3,blue,9,0\n", {}, "log.csv: t"),
+    "names of others": ("t,vehicle,lat,lon,vn\n0,red,48,11,0\n", {}, "log.csv: column kind"),
     "headers that are short": ("t,vehicle,lat,lon,speed\n0,red,48,11,0\n1,red,48,11,0\n", {}, "fixes"),
 }
 

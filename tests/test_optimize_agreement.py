@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
-from random_graphs import random_graph, star
+from random_graphs import AB, random_graph, star
 from shell import ROOT
 
 from coopoc import V2X, Sensors, load_fleet, observe
@@ -116,10 +116,10 @@ def test_a_tight_relaxation_is_near_before_it_is_refined(name):
         assert found.x == pytest.approx(ours.x, abs=2e-2)
 
 
-NO_FIX = Problem(("a", "b", "c")).add("range", [("a", "b"), ("b", "c")], [[5.0], [6.0]], std=1.0)
-APART = Problem(("a", "b", "c", "d")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
-DETACHED = APART.add("displacement", [("a", "b"), ("c", "d")], [[4, 0, 0], [1, 0, 0]], std=1.0)
-ONE_PLACE = Problem(("a", "b"), x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
+NO_FIX = Problem("abc").add("range", [AB, ("b", "c")], [[5.0], [6.0]], std=1.0)
+APART = Problem("abcd").add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+DETACHED = APART.add("displacement", [AB, ("c", "d")], [[4, 0, 0], [1, 0, 0]], std=1.0)
+ONE_PLACE = Problem("ab", x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "truncated"])
@@ -156,4 +156,4 @@ def test_what_cannot_be_solved_is_said_by_every_backend(backend):
         with refused(r"can move freely.*must be observable.*Add a position factor"):
             solve(problem, backend)
     with refused(r"a and b coincide.*keeps them apart"):
-        solve(ONE_PLACE.add("range", ("a", "b"), 4.0, std=1.0), backend)
+        solve(ONE_PLACE.add("range", AB, 4.0, std=1.0), backend)

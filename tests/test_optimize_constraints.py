@@ -74,7 +74,7 @@ def test_a_fix_on_a_plane_is_projected(seed):
     rng = default_rng(seed)
     n, p, c, std = rng.normal(size=3), rng.normal(size=3) * 5, rng.normal(), rng.uniform(1, 4, 3)
     S = np.diag(std**2)
-    problem = Problem(("a",)).add("position", "a", p, std=std).constrain("plane", "a", c, c, constants=n)
+    problem = Problem("a").add("position", "a", p, std=std).constrain("plane", "a", c, c, constants=n)
     solution = solved(problem)
     assert solution.x[0] == pytest.approx(p - S @ n * (n @ p - c) / (n @ S @ n), abs=1e-9)
     assert solution.covariance[0] == pytest.approx(S - np.outer(S @ n, S @ n) / (n @ S @ n), abs=1e-9)

@@ -104,7 +104,7 @@ def test_covariances_of_many_nodes_are_computed_where_asked():
 
 def test_anchors_among_poses_and_constraints_without_a_backend():
     with refused(r"anchors.*co.pose\(anchor, 0\)"):
-        Problem(("a", "l"), x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses=("a",))
+        Problem("al", x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses="a")
     for kind, nodes, backend in (("displacement", ("a", "b"), "osqp"), ("range", ("a", "b"), "casadi")):
         found = solve(PAIR.constrain(kind, nodes, upper=[7, 9, 9] if kind == "displacement" else 7.0))
         assert (found.backend, found.x[1, 0] - found.x[0, 0]) == (backend, pytest.approx(7.0, abs=1e-6))

@@ -151,7 +151,7 @@ def test_what_is_refused_leaves_the_estimate_as_it_was():
         with refused(field):
             live.add(factors, values)
     assert (live.x == before).all()
-    problem = co.Problem(("a",), dimension=2).add("position", "a", [0, 0], std=1.0)
+    problem = co.Problem("a", dimension=2).add("position", "a", [0, 0], std=1.0)
     with refused("1 constraints"):
         co.incremental(problem.constrain("position", "a", lower=0.0))
     with refused("params"):

@@ -82,7 +82,7 @@ def test_predictions_are_those_of_dense_algebra():
 
 def test_points_join_as_poses_do():
     """Closed form: of two fixes beside a known one the near one fits, and the mean of both is the answer."""
-    problem = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0)
+    problem = Problem("a").add("position", "a", [0, 0, 0], std=1.0)
     problem = problem.add("position", ["a", "a"], [[1.0, 0, 0], [50, 0, 0]], cov=np.eye(3))
     solution = solve_gnc(problem, [1])
     np.testing.assert_allclose(solution.x[0], [0.5, 0, 0], atol=1e-9)

@@ -9,7 +9,7 @@ import pytest
 from conftest import DESCENTS, measured, refused
 from numpy.linalg import inv, norm
 from numpy.random import default_rng
-from random_graphs import moved
+from random_graphs import AB, moved
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from unseen_graphs import alignment_error
@@ -117,24 +117,24 @@ def test_exp_and_log_are_scipys():
 
 def test_full_covariances_weigh_as_their_inverse():
     cov = np.array([[4.0, 1.0, 0], [1.0, 2.0, 0.5], [0, 0.5, 3.0]])
-    problem = Problem(("a",)).add("position", "a", [1.0, 2, 3], cov=cov)
+    problem = Problem("a").add("position", "a", [1.0, 2, 3], cov=cov)
     gap = np.array([1.0, -2.0, 0.5])
     assert problem.cost(gap[None] + [1, 2, 3]) == pytest.approx(0.5 * gap @ np.linalg.solve(cov, gap))
     assert solve(problem).covariance[0] == pytest.approx(cov)
 
 
-PLANE = Problem(("a", "b"), dimension=2, poses=("a",))
+PLANE = Problem("ab", dimension=2, poses="a")
 WRONG = {
     "no pose": (lambda: PLANE.add("bearing", ("b", "a"), 0.1, std=0.1), "must be a pose"),
     "space in the plane": (lambda: PLANE.add("position", "a", [0, 0, 0], std=1.0), "must fit a problem of 2"),
-    "no such angle": (lambda: PLANE.add("inclination", ("a", "b"), 1.0, std=0.1), "must fit a problem of 2"),
-    "an angle of 270": (lambda: PLANE.add("bearing", ("a", "b"), 270.0, std=0.1), "looks like degrees"),
+    "no such angle": (lambda: PLANE.add("inclination", AB, 1.0, std=0.1), "must fit a problem of 2"),
+    "an angle of 270": (lambda: PLANE.add("bearing", AB, 270.0, std=0.1), "looks like degrees"),
     "not a rotation": (lambda: PLANE.add("pose", "a", [0, 0, 1, 1, 0, 1], std=0.1), "rotation matrices"),
     "not positive": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [2, 1]]), "symmetric positive definite"),
     "not symmetric": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [0, 9]]), "not symmetric"),
-    "no dt": (lambda: PLANE.add("speed", ("a", "b"), 10.0, std=0.1), "1 finite numbers for speed"),
-    "held nowhere": (lambda: Problem(("a",), fixed=("a",)), "needs an x0"),
-    "four dimensions": (lambda: Problem(("a",), dimension=4), "must be 2 or 3"),
+    "no dt": (lambda: PLANE.add("speed", AB, 10.0, std=0.1), "1 finite numbers for speed"),
+    "held nowhere": (lambda: Problem("a", fixed="a"), "needs an x0"),
+    "four dimensions": (lambda: Problem("a", dimension=4), "must be 2 or 3"),
 }
 
 

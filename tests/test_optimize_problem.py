@@ -124,13 +124,14 @@ BAD = {
         "is not quadratic",
     ),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
-    "twice a name": (lambda: Problem(("b", "a", "a")), r"\['a'\]: must be unique"),
+    "whole numbers for names": (lambda: Problem((2, 1)), r"names = .2, 1.: must be a sequence of texts"),
+    "twice a name": (lambda: Problem("baa"), r"\['a'\]: must be unique"),
     "x0": (lambda: Problem(AB, x0=np.zeros((3, 3))), "shape"),
-    "no factors": (lambda: solve(Problem(("a",))), "no measurements"),
+    "no factors": (lambda: solve(Problem("a")), "no measurements"),
     "words for z": (lambda: PAIR.add("range", AB, "far", std=1.0), "array of numbers"),
     "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
     "shown": (lambda: Problem(AB, shown="c"), "node = .c.: must be one of a, b"),
-    "x0 not finite": (lambda: Problem(("a",), x0=[[nan, 0, 0]]), "x0 = not finite"),
+    "x0 not finite": (lambda: Problem("a", x0=[[nan, 0, 0]]), "x0 = not finite"),
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
@@ -213,7 +214,7 @@ def test_a_point_that_can_turn_around_another_is_free(backend):
     rng = default_rng(0)
     for _ in range(20):
         x0 = np.concatenate([[[0, 0, 0], [9, 0, 0]], rng.normal(0, 9, (1, 3))])
-        hanging = Problem(("a", "b", "c"), PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
+        hanging = Problem("abc", PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
         bounded = hanging.constrain("position", "a", upper=50.0) if backend == "osqp" else hanging
         solution = solve(bounded, backend, throw=False)
         assert solution.status is Status.RANK_DEFICIENT

@@ -154,7 +154,7 @@ def test_rejecting_a_quarter_is_doubtful():
     """Closed form: of 8 fixes of a point 3 are 50 m off."""
     z = np.zeros((8, 3))
     z[:3] = 50.0
-    problem = Problem(("a",)).add("position", ["a"] * 8, z + 1e-3 * np.arange(24).reshape(8, 3), std=1.0)
+    problem = Problem("a").add("position", ["a"] * 8, z + 1e-3 * np.arange(24).reshape(8, 3), std=1.0)
     assert solve_gnc(problem, [0]).notes[0].startswith("DOUBTFUL: GNC rejects 3 of 8 candidates")
 
 

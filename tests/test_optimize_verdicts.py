@@ -146,7 +146,7 @@ def test_a_lower_bound_is_below_the_cost(seed):
 
 
 def held(lower: float) -> Solution:
-    return solve(Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
+    return solve(Problem("a").add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
 
 
 def test_bounds_that_push_are_no_local_minimum():

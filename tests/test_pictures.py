@@ -192,6 +192,4 @@ def test_a_solution_shows_nodes_factors_and_headings(seen):
     assert_array_equal(ax.lines[0].get_xydata(), solution.position[:, :2])
     assert [text.get_text() for text in ax.texts] == list(solution.names)
     with refused("must be the one that was solved"):
-        co.plot_solution(
-            solution, problem=co.Problem(("a", "b")).add("position", ["a", "b"], np.zeros((2, 3)), std=1.0)
-        )
+        co.plot_solution(solution, problem=co.Problem("ab").add("position", ["a", "b"], np.zeros((2, 3)), std=1.0))

@@ -346,5 +346,5 @@ def _refuse(
     """InputError at the first row that is wrong, with what is given there."""
     rows = np.flatnonzero(wrong)
     if len(rows):
-        entry = np.asarray(values)[rows[0]].tolist()
-        raise InputError(location(field, int(rows[0])), f"{label}{entry}", allowed, hint)
+        entry = f"{label}{np.asarray(values)[rows[0]].tolist()}"
+        raise InputError(location(field, int(rows[0])), entry, allowed, hint)

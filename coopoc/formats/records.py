@@ -49,8 +49,7 @@ class Record:
     @property
     def words(self) -> str:
         """Names of the words between the tag and the noise."""
-        names = "i j" if len(self.ends) == 2 else "i"
-        return f"{'stamp ' * self.stamped}{names}{' offset' * self.offset} {self.values}"
+        return f"{'stamp ' * self.stamped}i{' j' * (len(self.ends) == 2)}{' offset' * self.offset} {self.values}"
 
     @property
     def size(self) -> int:

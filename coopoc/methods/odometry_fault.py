@@ -21,8 +21,7 @@ def when(t: Floats, marked: Bools) -> str:
     '(0 to 1, 3 to 3 s)'
     """
     times = [f"{round(t[a], 3):.13g} to {round(t[b - 1], 3):.13g}" for a, b in stretches(marked)]
-    more = f", and {len(times) - 3} times more" * (len(times) > 3)
-    return f"({', '.join(times[:3])} s{more})"
+    return f"({', '.join(times[:3])} s{f', and {len(times) - 3} times more' * (len(times) > 3)})"
 
 
 def with_odometry(

@@ -219,9 +219,9 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
 def _check_noise(graph: Graph, nodes: Ints, variance: Floats) -> None:
     """InputError unless the least variance (M,) of each measurement is positive."""
     for k in np.flatnonzero(~(variance > 0))[:1]:
-        whose = " and ".join(graph.names[i] for i in nodes[k])
+        whose = f"of {' and '.join(graph.names[i] for i in nodes[k])}: least variance {variance[k]:.3g}"
         hint = "Give every component a variance, or remove the measurement."
-        raise InputError("covariance", f"of {whose}: least variance {variance[k]:.3g}", "must be positive", hint)
+        raise InputError("covariance", whose, "must be positive", hint)
 
 
 def _fixed(graph: Graph) -> tuple[int, ...]:

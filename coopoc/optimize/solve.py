@@ -316,7 +316,7 @@ def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) ->
 def _raise(solution: Solution) -> None:
     if solution.status is not Status.RANK_DEFICIENT:
         raise SolveError(solution)
-    shown = ", ".join(solution.unobservable[:6]) + (", ..." if len(solution.unobservable) > 6 else "")
+    lacks = solution.unobservable
     hint = "Add a position factor (a fix) to one of them, or more measurements between them."
     if rejected := [note for note in solution.notes if "rejects" in note]:
         hint = f"The {', the '.join(rejected)}: give a nearer x0 or a larger scale, or measure more."
@@ -324,7 +324,8 @@ def _raise(solution: Solution) -> None:
         hint = f"{lost[0]}: look for outliers."
     raise InputError(
         "problem",
-        f"{len(solution.unobservable)} of {len(solution.names)} points can move freely ({shown})",
+        f"{len(lacks)} of {len(solution.names)} points can move freely "
+        f"({', '.join(lacks[:6])}{', ...' * (len(lacks) > 6)})",
         "must be observable",
         hint,
     )

@@ -137,7 +137,7 @@ def tiny(kind: str = "spherical") -> Problem:
 
 
 def check() -> int:
-    """Name libraries that are missing, and solve one tiny problem with every backend.
+    """Name libraries that are missing, and solve one tiny problem with every backend; of a log: coopoc data check LOG.
 
     Example: coopoc check
     """

@@ -136,14 +136,13 @@ class Table:
     def to_html(self) -> str:
         """A <table> without styling of its own."""
         titles = [escape(visible(title)).replace(" = ", "&nbsp;=&nbsp;") for title in self.header]  # on one line
-        head = "".join(f"<th scope=col>{title}</th>" for title in titles)
         shown = self._body(lambda text: escape(visible(text)), "<strong>{}</strong>", " <span class=interval>{}</span>")
         body = ""
         for row, texts in zip(self.rows, shown, strict=True):
             kinds = ("" if isinstance(entry, str) else " class=number" for entry in row)
             body += f"<tr>{''.join(f'<td{kind}>{text}</td>' for kind, text in zip(kinds, texts, strict=True))}</tr>"
-        caption = f"<caption>{escape(visible(self.words))}</caption>"
-        return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        head = f"<thead><tr>{''.join(f'<th scope=col>{title}</th>' for title in titles)}</tr></thead>"
+        return f"<table><caption>{escape(visible(self.words))}</caption>{head}<tbody>{body}</tbody></table>"
 
     _repr_html_ = to_html
     """HTML for a notebook."""

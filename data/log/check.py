@@ -63,6 +63,8 @@ UNUSED_SHARE = 0.05
 """Share of the logged rows that may be left out without a sentence."""
 AXIS_TURN = 20.0
 """Degrees by which odometry is turned from which its forward axis is another."""
+JUMP_NIS = 1e3
+"""NIS of a fix that is no noise."""
 FAR_AWAY = 3e5
 """m, from all others, where no vehicle cooperates."""
 LEAST_BACK = 0.02
@@ -73,7 +75,7 @@ USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of reasons that are no fault of the log."""
-FAULTS = "stamps of", OTHER_RATES.split("{")[0]
+FAULTS = "stamps of", "fixes far from", OTHER_RATES.split("{")[0]
 """Beginnings of what is assumed that is a fault."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
@@ -289,7 +291,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         )
     axes = _axes(c, column)
     sentences += [f"{name}: {sentence}" for sentence in (_noisier(c, column), axes) if sentence]
-    if axes or any(what.startswith(FAULTS[1]) and name in who for what, who in c.log.summary.assumed.items()):
+    if axes or any(what.startswith(FAULTS[-1]) and name in who for what, who in c.log.summary.assumed.items()):
         return sentences
     if _beyond(row, "fixes_late_s", BEHIND):
         say(
@@ -325,7 +327,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     elif name in c.failing and all(MAY in one for one in sentences):
         moved, driven, *_ = moves(c, column)
         back = abs(moved + driven) < 0.5 * abs(moved)
-        cause = "slips, or a speed or heading that is held or wrong."
+        cause = "slips, a counter that begins anew, or a speed or heading that is held or wrong."
         if back.sum() >= 3 and back.mean() > LEAST_BACK:
             cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
         say(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
@@ -348,10 +350,17 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
             f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
         )
     most = 2.0 if all(MAY in one for one in sentences) else inf
-    if nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= most:
+    squares = np.nan_to_num(c.normalised[:, column])
+    at = squares.argmax()
+    if most == 2.0 and squares[at] > JUMP_NIS and squares[:at].sum() < OUTLYING * at:
+        say(
+            f"{name}: its fixes jump by {np.linalg.norm(c.fix[at, column]):.3g} m at {c.world.t[at] - c.world.t[0]:.1f}"
+            " s, and stay there: another zone, frame, place or base station?"
+        )
+    elif nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= most:
         say(
             f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
-            "as stated, or correlated in time. Give std columns or sensors=."
+            "as stated, or correlated in time. Give std columns in m, or sensors=."
             + " Were variances given as deviations?"
             * bool(0.8 < nis * c.fix_noise / 2**0.5 < 1.25)
         )
@@ -371,6 +380,17 @@ def _may(row: Mapping[str, Any], name: str, least: float) -> str:
 def _late(c: Check, row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row is late beside the truth."""
     return _beyond(row, "late_s", max(LEAST_LAG, 0.1 * c.world.dt), SURE_CLOCK_ERRORS)
+
+
+def _of_presence(c: Check) -> Iterator[str]:
+    """Vehicles that are there when no other is."""
+    there = c.world.present[:, [c.world.ids.index(row["vehicle"]) for row in c.vehicles]]
+    for row, met in zip(c.vehicles, there.T @ there, strict=True):
+        if len(met) > 1 == met.sum():
+            yield (
+                f"{row['vehicle']}: it is there when no other vehicle is: do clocks or time zones differ (clock=; "
+                "dates without a zone are UTC), is it another drive, or one that has another name before?"
+            )
 
 
 def _of_clocks(c: Check) -> list[str]:
@@ -502,6 +522,7 @@ def _below(errors: Mapping[str, float], enough: float) -> str:
 
 CHECKS: tuple[Callable[[Check], Iterable[str]], ...] = (
     _of_rows,
+    _of_presence,
     _of_clocks,
     of_ranges,
     of_places,

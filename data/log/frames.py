@@ -26,6 +26,8 @@ ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed", "vy_body")
 Origin = tuple[float, float, float]
 WEEK = 604800.0
+FAR_M = 7e4
+"""m, from the origin from which its north is another: by half a degree."""
 PERIODS = 3600.0, WEEK / 7, WEEK, 2**32 / 1000, 1024 * WEEK
 """s, after which clocks begin anew: an hour, where summer time ends, a day, a GPS week, 32 bits of milliseconds, and
 the number of a week."""
@@ -171,6 +173,12 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
         latitude, longitude, height = fixes.iloc[0].tolist()
         origin = latitude, longitude, height
     metres = np.column_stack(pymap3d.geodetic2enu(*fixes.to_numpy().T, *origin))
+    for name in fixes.index[np.hypot(*metres.T[:2]) > FAR_M].unique("vehicle"):
+        summary.assume(
+            "fixes far from the origin, over 70 km, of {}: headings and velocities count from the north of the origin, "
+            "which is another. Read each place alone (since=, until=, or a folder each), with an origin= near it",
+            name,
+        )
     enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
     value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(keys).index).to_numpy())
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin

@@ -147,8 +147,9 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     members_too, inside = (observer >= 0) & (neighbour >= 0), step >= 0
     both = members_too & inside & there[step, observer] & there[step, neighbour]
     good = both & np.isfinite(value)
+    absent = {*rows["vehicle"], *rows["partner"]} - {*members}
     for wrong, reason in (
-        (~members_too, "relative measurements of members without a position"),
+        (~members_too, f"relative measurements of members without a position ({', '.join(sorted(absent))})"),
         (members_too & ~inside, "relative measurements outside the recording"),
         (members_too & inside & ~both, "relative measurements while one of the two is absent"),
         (both & ~good, f"{'azimuths' if body else 'bearings'} at times without a heading"),

@@ -203,8 +203,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
                 "needs numbers, and a heading of the vehicle",
                 f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s.",
             )
-        by = f"the course of the {pointing.source}" if pointing.source else "its heading"
-        summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, by {by})")
+        by = f"by {f'the course of the {pointing.source}' if pointing.source else 'its heading'})"
+        summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, {by}")
         angle = pd.Series(pointing.at(fixes.t)).ffill().bfill().to_numpy()
         fixes = Signal(fixes.t, fixes.value - turned(off, angle))
         way = way._replace(fixes=fixes)

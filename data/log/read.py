@@ -499,6 +499,6 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
         position[..., 2] = heights.fillna(0.0).where(np.isfinite(position[..., 0]))
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = nan
-    velocity = backward_difference(steps, position, ids)
+    velocity = backward_difference(steps, position, ids, file)
     turned = wrap(angle) if np.isfinite(angle).any() else None
     return Fleet(ids, steps, position, velocity, name=name, source=f"truth of {name}", heading=turned)

@@ -200,10 +200,10 @@ def of_measurements(c: Check) -> Iterator[str]:
             )
         of_pairs = misfits and (not wrong or hint == HINTS[name])
         if wrong and not of_pairs:
-            stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
-            yield f"{word}s miss the positions by {stated}. {hint}"
+            yield (
+                f"{word}s miss the positions by {median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected. {hint}"
+            )
         if of_pairs:
-            count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
             ends = set.intersection(*map(set, misfits))
             one = "".join(ends) if len(ends) == 1 else ""
             worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:NAMED_CASES]
@@ -212,7 +212,8 @@ def of_measurements(c: Check) -> Iterator[str]:
                 f"{one}: its clock is {abs(np.median(clocks)):.1f} s {'ahead of' if clocks[0] > 0 else 'behind'} the "
                 f"others' by all {word}s that are off: clock={one}:{np.median(clocks):.1f}, and check again."
                 if one and np.ptp(clocks) < LONG_LAG
-                else f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
+                else f"{word}s of {len(misfits)} of {len({*zip(links.observer, links.neighbour, strict=True)})} "
+                "that measure another are off for long, by no offset: "
                 f"{', '.join(' to '.join(pair) + misfits[pair][1] for pair in worst_of)}"
                 f"{', ...' * (len(misfits) > NAMED_CASES)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
                 "position or clock, or a value that is held."
@@ -221,25 +222,24 @@ def of_measurements(c: Check) -> Iterator[str]:
             some = [one for one in pairs if (abs(one[1]) > SURE_ERRORS * one[2]) == (verb != MAY)]
             if not some:
                 continue
-            shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in some)
-            offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in some)
             yield (
-                f"{word}s of {shown} {verb} off in the median, with {least:.3g} {unit} stated: an "
+                f"{word}s of {', '.join(f'{pair} by {off:+.3g} +- {error:.2g} {unit}' for pair, off, error in some)} "
+                f"{verb} off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (
-                    f"offset={offsets_text} takes it off."
+                    f"offset={','.join(f'{pair}:{off:.3g}' for pair, off, _ in some).replace(' and ', '-')} takes it "
+                    "off."
                     if word == "range"
                     else f"if of all that one measures, offset={some[0][0].split(' to ')[0]}.{word}:{some[0][1]:.3g} "
                     "takes it off (named and in the unit as logged)."
                 )
             )
         if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):
-            size, std_of = ("less", max(noise, MIN_STD_SHARE * least)) if noise < least else ("more", noise)
-            unstated = name in "".join(c.log.summary.assumed.get(UNSTATED, ()))
-            known, hint = ("assumed", "") if unstated else ("stated", " Were variances given as deviations?")
+            known = "assumed" if name in "".join(c.log.summary.assumed.get(UNSTATED, ())) else "stated"
             yield (
-                f"{word}s scatter {size} than {known}, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
-                f"{known}: std={word}:{std_of:.2g}.{hint}"
+                f"{word}s scatter {'less' if noise < least else 'more'} than {known}, by {noise:.2g} {unit} from one "
+                f"to the next, {least:.2g} {unit} {known}: std={word}:{max(noise, MIN_STD_SHARE * least):.2g}."
+                f"{' Were variances given as deviations, or another unit?' * (known == 'stated')}"
             )
 
 

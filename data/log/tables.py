@@ -119,7 +119,9 @@ def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str
     columns = {name: of for name, of in columns.items() if name in frame and of[0] not in ignore}
     if not columns:
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
-        raise missing_column(file, "kind", frame, allowed, more=' Or name the columns: kinds={"...": "speed_kmh"}.')
+        usual = [f"{key}:{header}" for header in map(str, frame) if (key := usual_key(header)) not in ("", header)]
+        more = f" Without one, name the others: ?columns={','.join(usual) or 'speed_kmh:...'}."
+        raise missing_column(file, "kind", frame, allowed, more=more)
     own = [name for name, (_, partner) in columns.items() if not partner]
     if "std" in frame and {KINDS[columns[name][0]].group for name in own} == {"fix"}:
         summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(own)}")

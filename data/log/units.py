@@ -70,7 +70,10 @@ VAGUE, NONSENSE = 30.0, 50.0
 measured" (the square of it, if it does not), and the least that can, in any unit: fixes may be of 2 cm or 5 m."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
 DECIMAL = " Degrees are decimal: scale=latitude:1e-7,longitude:1e-7 of integers, 48.1173 for 4807.04 of NMEA."
-UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
+UNIT = (
+    "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one. "
+    "Are few rows so, as where a counter begins anew? Remove them."
+)
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
 Rows = pd.DataFrame

@@ -79,9 +79,9 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
     lacking = np.isnan(first) & np.isnan(poses) & np.isfinite(recording.velocity[:, 0, :, :1])
     for column in columns:
         if lacking[:, column].any():
-            what = "position" if lacking[:, column, :3].any() else "heading"
+            what = f"no {'position' if lacking[:, column, :3].any() else 'heading'} of {recording.ids[column]}"
             hint = "Give begin=, or that of co.pose_start(recording)."
-            raise InputError("begin", f"no {what} of {recording.ids[column]}", "must be known at the start", hint)
+            raise InputError("begin", what, "must be known at the start", hint)
     return poses
 
 

@@ -154,8 +154,8 @@ def _words(problem: Problem, rows: Rows) -> str:
     worst = rows.outside.argmax()
     k, row, component = rows.origin[worst].tolist()
     item = problem.constraints[k]
-    nodes = " and ".join(problem.names[n] for n in item.nodes[row])
     below = rows.value[worst] < rows.lower[worst]
     side, bound = ("below its lower", rows.lower[worst]) if below else ("above its upper", rows.upper[worst])
-    which = f", component {component}," if item.lower.shape[1] > 1 else ""
-    return f"{item.kind} of {nodes}{which} is {rows.outside[worst]:.3g} {side} bound {bound:.6g}"
+    which = f", component {component}," * (item.lower.shape[1] > 1)
+    nodes = f"{item.kind} of {' and '.join(problem.names[n] for n in item.nodes[row])}"
+    return f"{nodes}{which} is {rows.outside[worst]:.3g} {side} bound {bound:.6g}"

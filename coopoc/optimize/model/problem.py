@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade
+from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade, texts
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise
 from .factor import Constraint, Factor, check_rotations, stacked, taken, unchecked
@@ -99,6 +99,8 @@ class Problem:
         for field in ("names", "factors", "poses", "fixed", "constraints"):
             if not isinstance(value := getattr(self, field), str | Sequence):
                 self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
+        if [*self.names] != [*range(len(self.names))]:
+            texts("names", [*self.names])  # other whole numbers would look like indices
         self.__dict__["names"] = names = tuple(map(str, self.names))
         if len(self._place) != len(names):
             twice = sorted({n for n in names if names.count(n) > 1})
@@ -289,11 +291,11 @@ class Problem:
         count: Counter[str] = Counter()
         for factor in self.factors:
             count[factor.kind] += len(factor.nodes)
-        kinds = ", ".join(f"{number} {kind}" for kind, number in count.items())
         what = "points" if not self.poses else "poses" if len(self.poses) == len(self.names) else "nodes"
-        plane = " in the plane" if self.dimension == 2 else ""
-        bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
-        return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{bound})"
+        plane = " in the plane" * (self.dimension == 2)
+        kinds = ", ".join(f"{number} {kind}" for kind, number in count.items()) or "no factors"
+        bound = f"; {len(self.constraints)} constraints" * bool(self.constraints)
+        return f"Problem({len(self.names)} {what}{plane}; {kinds}{bound})"
 
 
 _space = cache(Space)
@@ -337,8 +339,8 @@ def no_such_node(
     node: Any, names: Sequence[str], hint: str = "Give its index, or name the point when the Problem is made."
 ) -> InputError:
     """The error for a node that is neither a name nor an index."""
-    listed_names = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    return InputError("node", shown(node), f"must be one of {listed_names}", suggestion(node, names, hint))
+    allowed = f"must be one of {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
+    return InputError("node", shown(node), allowed, suggestion(node, names, hint))
 
 
 def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:

@@ -231,8 +231,8 @@ def file(graph: Graph) -> Floats:
     """
     unknown = ~np.isfinite(graph.position).all(axis=1)
     if unknown.any():
-        name = graph.names[int(np.flatnonzero(unknown)[0])]
-        raise InputError("start", "'file'", f"needs a position of {name} in the file", 'Use start="odometry".')
+        needs = f"needs a position of {graph.names[int(unknown.argmax())]} in the file"
+        raise InputError("start", "'file'", needs, 'Use start="odometry".')
     return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
 
 
