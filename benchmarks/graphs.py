@@ -15,6 +15,7 @@ its seconds contain the search for the start, the checks and all marginals, GTSA
 import argparse
 import os
 import resource
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -138,6 +139,15 @@ def rows(files: list[Path], hard: bool) -> Iterator[list[object]]:
             yield [file.name, str(reason)]
 
 
+def shown(each: Iterator[list[object]]) -> list[list[object]]:
+    """All rows, each printed to stderr when it is there: large graphs take GTSAM many minutes."""
+    found = []
+    for cells in each:
+        print(*(f"{cell:.6g}" if isinstance(cell, float) else cell for cell in cells), file=sys.stderr, flush=True)
+        found.append(cells)
+    return found
+
+
 def main() -> None:
     """Print the table, and the totals."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -148,12 +158,12 @@ def main() -> None:
     parser.add_argument("--sizes", action="store_true", help="the same of growing size")
     given = parser.parse_args()
     if given.unseen or given.sizes:
-        found = list(unseen(SIZES if given.sizes else FAMILIES, given.unseen or 1))
+        found = shown(unseen(SIZES if given.sizes else FAMILIES, given.unseen or 1))
     elif not given.folder.is_dir():
         parser.error(f"no folder {given.folder}")
     else:
         files = sorted(f for f in given.folder.rglob("*") if f.suffix in GRAPHS)
-        found = list(rows([f for f in files if not given.names or f.stem in given.names], given.hard))
+        found = shown(rows([f for f in files if not given.names or f.stem in given.names], given.hard))
     ended = [r for r in found if len(r) > 2]
     total: list[object] = ["total", *[""] * 15]
     for column in (SECONDS, FROM_ODOMETRY, GTSAM_SECONDS):
