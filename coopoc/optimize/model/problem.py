@@ -99,9 +99,10 @@ class Problem:
         for field in ("names", "factors", "poses", "fixed", "constraints"):
             if not isinstance(value := getattr(self, field), str | Sequence):
                 self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
-        if [*self.names] != [*range(len(self.names))]:
+        names = tuple(map(str, self.names))
+        if names != tuple(map(str, range(len(names)))):
             texts("names", [*self.names])  # other whole numbers would look like indices
-        self.__dict__["names"] = names = tuple(map(str, self.names))
+        self.__dict__["names"] = names
         if len(self._place) != len(names):
             twice = sorted({n for n in names if names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
