@@ -105,10 +105,8 @@ class MissingLibraryError(ImportError):
 
 def _where(package: str) -> str:
     """An extra of coopoc as pip finds it: in the folder that it was installed from, else on the index."""
-    try:
-        source = json.loads(metadata.distribution("coopoc").read_text("direct_url.json") or "{}")
-    except metadata.PackageNotFoundError:
-        return package
+    texts = (each.read_text("direct_url.json") for each in metadata.distributions(name="coopoc"))
+    source = json.loads(next(filter(None, texts), "{}"))  # what pip left in a clone that it built has none
     if not package.startswith("'coopoc[") or not (url := str(source.get("url", ""))).startswith("file:"):
         return package
     editable = "-e " if source.get("dir_info", {}).get("editable") else ""
