@@ -263,7 +263,7 @@ class PoseFilter:
             spread[:3] = np.maximum(spread[:3], sensors.fix_std)
         noise = self._settings(sensors, recording.dt)
         measured = pose_measurements(recording, members, links, kept, landmark)
-        pairs = 1 + int(measured.ends[:, 2].max(initial=0))
+        pairs = 1 + int(noise.longer * measured.ends[:, 2].max(initial=0))
         poses, pair = new_poses(len(members) * noise.d + pairs), new_poses(2 * noise.d + 1)
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
         faults = new_faults(len(members), noise, recording.dt)
