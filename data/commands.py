@@ -85,8 +85,7 @@ def _fields(entry: Entry) -> dict[str, str]:
         for file, (address, size, digest) in entry.files.items()
     }
     how = entry.by_hand or f"no: coopoc data get {entry.name}"
-    fetched = {"fetched": str(entry.path) if entry.fetched else how}
-    return stated | {"addresses": entry.tried} | fetched | files
+    return stated | {"addresses": entry.tried} | {"fetched": str(entry.path) if entry.fetched else how} | files
 
 
 def _print(name: str, fields: dict[str, str]) -> None:

@@ -56,8 +56,7 @@ def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
     frame = fleet.to_frame().rename(columns={"vehicle": "id"}).round({"t": 6})[[*NEEDED, *velocity * VELOCITY]]
     frame = frame.sort_values("id", key=lambda ids: ids.map(fleet.ids.index), kind="stable")
     if path.suffix != ".parquet":
-        named = frame.assign(id=frame["id"].map(spreadsheet))
-        write(path, named.to_csv(index=False, lineterminator="\n"))
+        write(path, frame.assign(id=frame["id"].map(spreadsheet)).to_csv(index=False, lineterminator="\n"))
     else:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
         options: dict[str, Any] = {"use_dictionary": ["id", "t"], "column_encoding": split}

@@ -155,8 +155,7 @@ def start(p: Params) -> Floats | None:
     """True first positions (E, 3) m of the egos if the cell starts there, as KalmanNet's published loop does."""
     if scene.start(p) == "gnss":
         return None
-    drive = scene.fleet(p["data"])
-    first = drive.position[0, scene.recording(p).columns(scene.egos(p))]
+    first = scene.fleet(p["data"]).position[0, scene.recording(p).columns(scene.egos(p))]
     refuse("start", first, np.isnan(first), "needs a truth of each ego at the first step", "Take start=gnss.")
     return first
 

@@ -140,8 +140,7 @@ def _logged(log: Log, span: str) -> Source:
     posed = truth is not None and truth.heading is not None
     digests = {"log": digest(recording), "truth": truth.digest if truth else ""}
     seconds, made = float(np.ptp(recording.t)), lru_cache(maxsize=2)(drive)
-    vehicles = len(recording.vehicles)
-    return Source(seconds, vehicles, marks, posed, digests, made, lambda until: begun(), text)
+    return Source(seconds, len(recording.vehicles), marks, posed, digests, made, lambda until: begun(), text)
 
 
 def near(k: int, loss: float = 0.0) -> V2X:

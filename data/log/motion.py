@@ -435,8 +435,7 @@ def _held(fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bo
     nearest, _ = steps.nearest(fixes.t)
     moves = there & (norm(velocity, axis=1) > STANDS)
     way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
-    before = last_true(~again)
-    return np.asarray(again & there[nearest] & (norm(way - way[before], axis=1) > std))
+    return np.asarray(again & there[nearest] & (norm(way - way[last_true(~again)], axis=1) > std))
 
 
 def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps) -> Floats:

@@ -39,7 +39,7 @@ MAX_ANGLE_STD, MIN_STD_SHARE = 0.5, 1e-3
 """rad, largest standard deviation of angles that is offered; least share of a stated one that is offered instead: of
 numbers without noise it would be 0."""
 HINTS = {
-    "range": "Do fixes drift, or are clocks, or the positions of one, off?",
+    "range": "Do fixes drift, or are clocks, tags or positions off?",
     "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "
     "whose heading they count from, and that no axis is mirrored.",
     "inclination": "Inclinations count from +z, elevations from the horizon.",

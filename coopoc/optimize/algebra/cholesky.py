@@ -182,8 +182,7 @@ def _dissected(pattern: Any) -> Ints:
 
 def _parents(lower: Any) -> Ints:
     """(n,) the first row of each column, -1 if there is none."""
-    first = np.append(lower.indices, -1)[lower.indptr[:-1]]
-    return np.where(np.diff(lower.indptr) > 0, first, -1).astype(int)
+    return np.where(np.diff(lower.indptr) > 0, np.append(lower.indices, -1)[lower.indptr[:-1]], -1).astype(int)
 
 
 def _runs(first: Ints, length: Ints) -> Ints:

@@ -98,10 +98,10 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     own_columns, along, exact = [], [], []
     for members, columns, block in _apart(rows.matrix[touched]):
         own = touched[members]
-        unit, pull = block / length[own, None], gradient.ravel()[columns]
-        scale = max(abs(pull).max(), 1e-300)
+        unit, partials = block / length[own, None], gradient.ravel()[columns]
+        scale = max(abs(partials).max(), 1e-300)
         bounds = np.where((low | equal)[own], -np.inf, 0.0), np.where((high | equal)[own], np.inf, 0.0)
-        of_active = scale * lsq_linear(unit.T, -pull / scale, bounds, method="bvls", tol=1e-14).x
+        of_active = scale * lsq_linear(unit.T, -partials / scale, bounds, method="bvls", tol=1e-14).x
         multipliers[own] = of_active / length[own]
         pushes = equal[own] | (of_active != 0)
         gap = (rows.value - np.where(multipliers < 0, rows.lower, rows.upper))[own] / length[own]

@@ -253,8 +253,7 @@ def _evened(J: Any) -> Any:
     """Rows of J (sparse) over their largest number: their weights hide no direction."""
     from scipy.sparse import diags_array
 
-    largest = abs(J).max(axis=1).toarray().ravel()
-    return diags_array(1.0 / np.maximum(largest, 1e-300)) @ J
+    return diags_array(1.0 / np.maximum(abs(J).max(axis=1).toarray().ravel(), 1e-300)) @ J
 
 
 def _null_rows(J: Any, length: Floats) -> Floats:

@@ -234,8 +234,7 @@ def doubts(x: Floats, ends: Iterable[tuple[float, Floats]], cost: Cost) -> tuple
     near = [each - least for each, _ in ends if higher(each, least) and each < least + RIVAL_COST]
     notes = (f"another minimum costs {min(near):.3g} more: noise may decide between them",) if near else ()
     alike = [y for each, y in ends if not higher(each, least) and abs(y - x).max() > SAME_COST * abs(x).max()]
-    elsewhere = any(cost(0.5 * (x + y)) > least + BARRIER for y in alike)
-    return (ELSEWHERE, *notes) if elsewhere else notes
+    return (ELSEWHERE, *notes) if any(cost(0.5 * (x + y)) > least + BARRIER for y in alike) else notes
 
 
 def reached_once(costs: Sequence[float], least: float) -> tuple[str, ...]:
