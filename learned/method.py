@@ -113,7 +113,7 @@ class LearnedGain(Alone):
         with one_core(), torch.inference_mode():
             moved = self.model(*lanes, recording.dt).numpy().astype(float)
         moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, 3), 2, 1)
-        estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
+        estimates = np.hstack([x0[:, None], moved + origin])
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
         return solo_track(recording, columns, estimates, None, began)

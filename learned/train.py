@@ -82,7 +82,9 @@ def train_all(
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     wanted = [job for name in recipes for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
     paths = {job: out / f"{job.label}.safetensors" for job in wanted}
-    missing = [job for job, path in paths.items() if not _made(path, job.key(fleet))]
+    missing = [
+        job for job, path in paths.items() if not (path.is_file() and read_card(path).get("key") == job.key(fleet))
+    ]
     if missing:
         made_folder(out)
     if jobs > 1 and len(missing) > 1:
@@ -137,10 +139,6 @@ def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | Non
     leave_with(parent)
     LINE.set(line or 0)
     _train(job, fleet, out, worst, line is not None)
-
-
-def _made(path: Path, key: str) -> bool:
-    return path.is_file() and read_card(path).get("key") == key
 
 
 def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:

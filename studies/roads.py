@@ -11,6 +11,7 @@ import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Method, Recording, Sensors, observe, read_log
 from coopoc.arrays import last_true
+from coopoc.data.log.links import under
 from coopoc.data.log.read import is_log
 from coopoc.data.log.residuals import in_space, plane
 from coopoc.data.source import split
@@ -60,7 +61,7 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     files = [located(data, name) for name in roads(data)[task]]
     if task == "kitti":  # poses 3x4 of a camera (x right, z ahead) in the plane, and fixes of 2.5 m that are drawn once
         poses = map(np.loadtxt, files)
-        ways = [np.column_stack([pose[:, 11], pose[:, 3], 0.0 * pose[:, 3]])[:, None] for pose in poses]
+        ways = [np.insert(pose[:, [11, 3]], 2, 0.0, axis=1)[:, None] for pose in poses]
         measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
         truth = Fleet(("car",), 0.1037 * np.arange(len(motion)), ways[1], motion, name="KITTI 00")
         drawn = observe(truth, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)
@@ -81,7 +82,7 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         starts = [start for start, _ in recording.stretches(column)]
         gone = np.setdiff1d(np.arange(len(clock)), [*kept[clock[kept] < PERIOD_SECONDS - OUTAGE_SECONDS], *starts])
         gnss[:, gone, column] = np.nan
-    return replace(recording, gnss=gnss), truth
+    return under(replace(recording, gnss=gnss), V2X(max_neighbours=0)), truth
 
 
 def road_row(task: str, data: Path | None, made: Method) -> Row:
@@ -96,7 +97,7 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
     start, column = int(CALIBRATION_SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
-    files = [located(data, name) for name in roads(data)[task]]
+    files = [located(data, name) for name in roads(data)[task]] or [Path(split(str(data))[0])]
     scored = _scored(made, recording, truth, start)
     return {"task": task, "data": hashed(*files), **scored, "received_bytes_per_second": 0}
 
@@ -198,7 +199,7 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     track = method(recording, egos)
     gap, nees = planar(track, fleet)
     size = min(BLOCK_SECONDS, len(recording.t) * recording.dt / MIN_BLOCKS) / recording.dt
-    blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
+    blocks = blocks_of(np.sqrt(np.vecdot(gap, gap).mean(axis=0)), 0, size)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
     row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}
     if track.covariance is not None:

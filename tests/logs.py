@@ -39,7 +39,7 @@ def long(recording: Recording, messages: bool = True) -> pd.DataFrame:
     ids, t = recording.ids, recording.t
     for step, column in zip(*np.nonzero(np.isfinite(recording.velocity[0, :, :, 0])), strict=True):
         base = {"t": t[step], "vehicle": ids[column]}
-        for axis, kind in enumerate(("x", "y", "z")):
+        for axis, kind in enumerate("xyz"):
             value = recording.gnss[0, step, column, axis]
             if np.isfinite(value):
                 rows.append({**base, "kind": kind, "value": value, "std": NOISE.gnss_std[axis]})
@@ -62,10 +62,7 @@ def long(recording: Recording, messages: bool = True) -> pd.DataFrame:
 
 def write(frame: pd.DataFrame, path: Path) -> Path:
     """A table as CSV or Parquet."""
-    if path.suffix == ".parquet":
-        frame.to_parquet(path, index=False)
-    else:
-        frame.to_csv(path, index=False)
+    getattr(frame, f"to_{path.suffix[1:]}")(path, index=False)
     return path
 
 

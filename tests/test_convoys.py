@@ -51,7 +51,7 @@ def test_star_filters_get_rows_on_convoys(tmp_path):
     recording, fleet = roads.convoy("convoy-kitti", measured())
     track = co.JointFilter()(recording, recording.ids)
     gap = (track.x - fleet.position)[..., :2]
-    assert joint["rt_le_m"][0] == pytest.approx(np.sqrt(np.square(gap).sum(-1).mean()), rel=0.15)  # a mean over blocks
+    assert joint["rt_le_m"][0] == pytest.approx(np.sqrt(np.vecdot(gap, gap).mean()), rel=0.15)  # a mean over blocks
     assert joint["rt_le_m"][0] < alone["rt_le_m"][0]
     assert (joint["received_bytes_per_second"] > 0, alone["received_bytes_per_second"]) == (True, 0)
     assert len(joint["blocks_m"]) == len(alone["blocks_m"])

@@ -263,7 +263,7 @@ def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path, lat
     for t in np.round(np.arange(0, 8, 0.1), 1):
         at = straight(t)
         for name, speed in (("east", 15.0), ("west", -10.0)):
-            rows += [(t, name, kind, "", value) for kind, value in zip(("x", "y"), at[name], strict=True)]
+            rows += [(t, name, kind, "", value) for kind, value in zip("xy", at[name], strict=True)]
             rows += [(t, name, "vx", "", speed), (t, name, "vy", "", 0.0)]
         then = straight(t + late)
         for other, place in (("west", then["west"]), ("mast", MAST)):
@@ -286,11 +286,11 @@ def test_bearings_in_body_frames_turn_with_the_car(tmp_path, late):
     """Closed form: the bearing of what is far away."""
     rows: list[tuple[Any, ...]] = []
     far = 1e6 * MAST
-    rows += [(0.0, "far", kind, "", value) for kind, value in zip(("x", "y"), far, strict=True)]
+    rows += [(0.0, "far", kind, "", value) for kind, value in zip("xy", far, strict=True)]
     for t in np.round(np.arange(0, 6, 0.1), 1):
         place, _ = circle(t)
         rows += [(t, "car", "speed", "", 6.0), (t, "car", "yaw_rate", "", 0.5)]
-        rows += [(t, "car", kind, "", value) for kind, value in zip(("x", "y"), place, strict=True)]
+        rows += [(t, "car", kind, "", value) for kind, value in zip("xy", place, strict=True)]
         then, heading = circle(t + late)
         bearing = np.arctan2(*(far - then)[::-1]) - heading
         rows.append((t + late, "car", "bearing", "far", np.arctan2(np.sin(bearing), np.cos(bearing))))

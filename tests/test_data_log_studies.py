@@ -282,8 +282,8 @@ def test_a_report_of_a_log_shows_no_settings_of_simulated_noise(folders, tmp_pat
         assert words in page
 
 
-def test_a_log_that_is_a_task_needs_a_truth(folders):
+def test_a_log_that_is_a_task_needs_a_truth_and_no_neighbour_counts(folders):
     assert [*roads(folders / "with"), *roads(folders / "without")] == ["with", "without"]
-    assert len(thinned("with", folders / "with")[1].t)
+    assert not len(thinned("with", folders / "with")[0].links)
     with refused("must hold a truth"):
         thinned("without", folders / "without")

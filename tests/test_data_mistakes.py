@@ -257,7 +257,7 @@ def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
     for now in t.tolist():
         for k, name in enumerate(names):
             x, y = at[k] + [8 * now, 0.1 * k * now]
-            made["long"] += [[now, name, kind, "", value] for kind, value in zip(("x", "y"), (x, y), strict=True)]
+            made["long"] += [[now, name, kind, "", value] for kind, value in zip("xy", (x, y), strict=True)]
             for j in {0, 1, 2} - {k}:
                 gap = np.hypot(*(at[j] + [8 * now, 0.1 * j * now] - [x, y]))
                 made["wide"].append([now, name, x, y, names[j].removesuffix(".0"), gap])
@@ -361,7 +361,7 @@ def test_places_need_no_times(tmp_path):
     """The same log, once with the mast's place at the first instant, once in a table of its own without one."""
     head, *rows = GOOD.splitlines()
     begin = min(float(row.split(",")[0]) for row in rows)
-    for name in ("a", "b"):
+    for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / "log.csv").write_text("\n".join([head, *rows]))
     (tmp_path / "a" / "mast.csv").write_text(f"t,vehicle,x,y,z\n{begin},mast,5,6,0\n")

@@ -52,7 +52,7 @@ def test_nmea_is_fixes_speed_and_course(tmp_path):
     pytest.importorskip("pynmeagps")
     fleet = drive(2, steps=100)
     start = datetime(2024, 2, 28, 23, 59, 55)
-    for column, name in enumerate(("a", "b")):
+    for column, name in enumerate("ab"):
         (tmp_path / f"{name}.nmea").write_text(nmea(fleet, column, start))
     log = read_log(tmp_path, origin=(48.14, 11.58, 560.0))
     rec = log.recording

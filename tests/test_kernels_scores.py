@@ -21,7 +21,7 @@ def test_errors_and_nees_are_numpys(track, crossing):
     gap = track.x - crossing.position[:, [0, 5]]
     assert_allclose(errors(track, crossing), norm(gap, axis=-1), rtol=1e-14)
     solved = solve(track.covariance, gap[..., None])[..., 0]
-    assert_allclose(nees(track, crossing), (gap * solved).sum(axis=-1), rtol=1e-9)
+    assert_allclose(nees(track, crossing), np.vecdot(gap, solved), rtol=1e-9)
 
 
 def test_runs_are_scored_by_fours(crossing, monkeypatch):
@@ -41,4 +41,4 @@ def test_a_start_that_is_known_has_no_nees(crossing):
     assert np.isfinite(found[:, 1:]).all()
     gap = (known.x - crossing.position[:, [0]])[:, 1:]
     solved = solve(known.covariance[:, 1:], gap[..., None])[..., 0]
-    assert_allclose(found[:, 1:], (gap * solved).sum(axis=-1), rtol=1e-9)
+    assert_allclose(found[:, 1:], np.vecdot(gap, solved), rtol=1e-9)

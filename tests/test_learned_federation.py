@@ -270,7 +270,7 @@ def replies(weights: Tensor, sizes: Tensor) -> list[Any]:
 
 def flat(record: Any) -> Tensor:
     """Flower's arrays as one row."""
-    return torch.from_numpy(np.concatenate([record[name].numpy().ravel() for name in ("a", "b")]))
+    return torch.from_numpy(np.concatenate([record[name].numpy().ravel() for name in "ab"]))
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def log(tmp_path_factory):
     """Two vehicles and a road-side unit for 80 s: odometry at 10 Hz, fixes at 2 Hz that are off by 4 m to the east of
     one vehicle, and the truth of both."""
     rng, rows, truth = default_rng(0), list[Any](), list[Any]()
-    for k, name in enumerate(("a", "b")):
+    for k, name in enumerate("ab"):
         x = np.array([0.0, 9.0 * k])
         for step in range(800):
             velocity = 6 * np.array([np.cos(0.01 * step), np.sin(0.01 * step)])
@@ -135,7 +135,7 @@ def log(tmp_path_factory):
             rows += [(t, name, kind, v) for kind, v in zip(("vx", "vy"), velocity + rng.normal(0, 0.2, 2), strict=True)]
             if step % 5 == 0:
                 fix = x + rng.normal(0, (1.0, 3.0), 2)
-                rows += [(t, name, kind, v) for kind, v in zip(("x", "y"), fix, strict=True)]
+                rows += [(t, name, kind, v) for kind, v in zip("xy", fix, strict=True)]
     rows += [(0.0, "mast", "x", 50.0), (0.0, "mast", "y", 50.0)]
     folder = tmp_path_factory.mktemp("log")
     pd.DataFrame(rows, columns=["t", "vehicle", "kind", "value"]).to_csv(folder / "measurements.csv")

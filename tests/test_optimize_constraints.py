@@ -311,6 +311,14 @@ def test_an_empty_set_is_infeasible_and_names_the_worst(case):
         assert caught.value.solution.extras["violated"]
 
 
+def test_bounds_of_an_angle_turn_with_the_problem():
+    costs = []
+    for turn in (0.0, np.pi, -np.pi, 3 * np.pi):
+        problem = Problem(AB, dimension=2).add("position", AB, [[0, 0], [5 * np.cos(turn), 0]], std=1.0)
+        costs.append(solve(problem.constrain("azimuth", AB, turn + 0.1, turn + 0.2)).cost)
+    assert costs == pytest.approx([costs[0]] * 4)
+
+
 @pytest.mark.parametrize("backend", sorted(set(backends()) - {"casadi"}))
 def test_a_backend_without_constraints_names_those_that_hold_them(backend):
     """Only osqp holds linear ones beside casadi."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import rivals
 from conftest import measured, winding
@@ -14,7 +15,8 @@ from coopoc import V2X, CooperativeFilter, Fleet, Kalman, Recording, Sensors, ob
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS
 from coopoc.studies import benchmark
-from coopoc.studies.roads import ROADS, road_row, roads, thinned
+from coopoc.studies.pose_drives import hashed
+from coopoc.studies.roads import ROADS, road_row, thinned
 
 TURNS = AS_STATED._replace(heading=0.1, scale=0.03, lasts=300.0, absent=-np.inf)
 """Errors of heading and scale, and no guard: the rivals' extended Kalman filter."""
@@ -60,21 +62,20 @@ def test_heading_and_scale_are_found():
 def test_a_log_of_ones_own_is_a_task(tmp_path):
     """Odometry turned by 0.15 rad: the cooperative filter alone is better."""
     recording, fleet = seen(6000, runs=1)
-    rows = ["t,vehicle,x,y,vx,vy"]
-    for t, fix, u in zip(recording.t, recording.gnss[0, :, 0], recording.velocity[0, :, 0], strict=True):
-        rows.append(f"{t},a,{fix[0]},{fix[1]},{u[0]},{u[1]}".replace("nan", ""))
-    true = [f"{t},a,{x},{y}" for t, (x, y, _) in zip(fleet.t, fleet.position[:, 0], strict=True)]
     data = tmp_path / "own"
     data.mkdir()
-    (data / "car.csv").write_text("\n".join(rows))
-    (data / "truth.csv").write_text("\n".join(["t,vehicle,x,y", *true]))
-    assert list(roads(data)) == ["own"]
+    frame = pd.DataFrame({"t": fleet.t, "vehicle": "a"})
+    frame[["x", "y"]] = fleet.position[:, 0, :2]
+    frame.to_csv(data / "truth.csv")
+    frame[["x", "y"]], frame[["vx", "vy"]] = recording.gnss[0, :, 0, :2], recording.velocity[0, :, 0, :2]
+    frame.to_csv(data / "car.csv")
     kept = np.isfinite(thinned("own", data)[0].gnss[0, :, 0, 0])
     assert 0.05 < kept.sum() / np.isfinite(recording.gnss[0, :, 0, 0]).sum() < 0.1
     assert not kept[recording.t % 180.0 >= 150.0].any()
     mine, usual = (road_row("own", data, method) for method in (CooperativeFilter(), Kalman()))
     assert mine["rt_le_m"][0] < 0.7 * usual["rt_le_m"][0]
     assert mine["nees"] < usual["nees"]
+    assert mine["data"] == hashed(data)
     assert np.mean(mine["blocks_m"]) == pytest.approx(mine["rt_le_m"][0], abs=1e-4)
     cards = [{"method": name, "tasks": [row]} for name, row in (("cooperative-filter", mine), ("kalman", usual))]
     less = co.paired_difference(np.array(usual["blocks_m"]), np.array(mine["blocks_m"]))

@@ -290,7 +290,7 @@ def pose_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints
     acting = (sensors.speed_scale_std, sensors.yaw_rate_bias_std, sensors.heading_bias_std * sensors.compass)
     lasting = [kind for kind, std in enumerate(acting) if std > 0]
     own, d = _own(sensors, lasting), 4 + len(lasting)
-    prior = np.concatenate([[0, 0, 0, 1.0 / UNKNOWN_HEADING_RAD2], 1.0 / np.square([acting[kind] for kind in lasting])])
+    prior = np.r_[0, 0, 0, 1.0 / UNKNOWN_HEADING_RAD2, 1.0 / np.square([acting[kind] for kind in lasting])]
     motion, process = _motion(fleet, sensors, lasting)
     stages = list[Stage]()
     for now, previous, edges in steps_of(fleet, links, members):

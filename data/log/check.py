@@ -178,7 +178,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
 
 def _rms(vectors: Floats) -> float | None:
     """Root of the mean squared length of vectors (M, 3), None where all are unknown."""
-    square = np.square(vectors).sum(axis=-1)
+    square = np.vecdot(vectors, vectors)
     return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else None
 
 
@@ -355,7 +355,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     at = squares.argmax()
     if most == 2.0 and squares[at] > JUMP_NIS and squares[:at].sum() < OUTLYING * at:
         say(
-            f"{name}: its fixes jump by {np.linalg.norm(c.fix[at, column]):.3g} m at {c.world.t[at] - c.world.t[0]:.1f}"
+            f"{name}: its fixes jump by {norm(c.fix[at, column]):.3g} m at {c.world.t[at] - c.world.t[0]:.1f}"
             " s, and stay there: another zone, frame, place or base station?"
         )
     elif nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= most:

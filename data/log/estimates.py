@@ -266,8 +266,8 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
     velocity that is made of `constant` (M,). What is within two standard errors is left out, the constant first, and
     what looks like another cause, which make up all but MIN_OWN_SHARE of it, as a lag does on a bend at one speed."""
     made = no_estimate(5)
-    for causes, extra in ((np.concatenate([x, [constant, 1j * constant]]), [-2, -1]), (x, [2]), (x[:2], [])):
-        unit = np.concatenate([causes.real, causes.imag], axis=1)
+    for causes, extra in ((np.r_[x, [constant, 1j * constant]], [-2, -1]), (x, [2]), (x[:2], [])):
+        unit = np.hstack([causes.real, causes.imag])
         unit /= np.maximum(norm(unit, axis=1, keepdims=True), 1e-12)
         alone = 1.0 / np.diag(inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
         if extra and ((alone < MIN_OWN_SHARE) & unit.any(axis=1)).any():
@@ -306,9 +306,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
 
     def made_by(velocity: Floats) -> Floats:
         moves = velocity[links.step, links.neighbour]
-        along = (gap * moves).sum(axis=1) / far
+        along = np.vecdot(gap, moves) / far
         across = (gap[:, 0] * moves[:, 1] - gap[:, 1] * moves[:, 0]) / flat**2
-        rate = (gap * (velocity[links.step, links.observer] - moves)).sum(axis=1) / far
+        rate = np.vecdot(gap, velocity[links.step, links.observer] - moves) / far
         of_range = np.column_stack([along[:, None] * ends, far, rate])
         return np.stack([of_range, np.pad(across[:, None] * ends, ((0, 0), (0, 2)))], axis=1)
 
@@ -322,9 +322,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     value, error = no_estimate(size + 2)
     value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z)
     measured = np.unique(pairs[:, there])
-    stay = max(noise**2 - world.sensors.range_std**2, 0.0) * share(c) / max(len(measured), 1)
-    varied = pd.DataFrame(x[:, -2:]).groupby(groups).transform("var", ddof=0).mean().clip(1e-12)
-    error[size:] = np.hypot(error[size:], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
+    stay = max(noise**2 - world.sensors.range_std**2, 0.0) * share(c) / np.where(which < size, 2, len(measured) or 1)
+    varied = (pd.DataFrame(x).groupby(groups).transform("var", ddof=0).sum() / (x != 0.0).sum(axis=0)).clip(1e-12)
+    error[which] = np.fmax(error[which], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
     error[measured[measured == reference]] = 0.0
     if reference is None and len(measured):
         apart = abs(np.subtract.outer(value[measured], value[measured]))
@@ -444,15 +444,14 @@ def worst(c: Check, column: int) -> tuple[str, float, float]:
     if truth is not None:
         for what, x, variance in (("filter errs", c.x, c.variance), ("fixes are off", *fixes)):
             square, stated = np.square(x - truth.position)[:, column, :size], variance[:, column, :size]
-            there = np.isfinite(square)
-            sums = [
-                pd.DataFrame(np.where(there, each, 0.0)).groupby(tenths).sum().sum(axis=1) for each in (square, stated)
-            ]
-            ratios = (sums[0] / sums[1])[sums[1] > 0.0] ** 0.5
+            off, usual = (
+                pd.DataFrame(each + 0.0 * square).groupby(tenths).sum().sum(axis=1) for each in (square, stated)
+            )
+            ratios = (off / usual)[usual > 0.0] ** 0.5
             if ratios.max() > CONFIDENT_RATIO:
                 return what, float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
     parts = squares.groupby(tenths[squares.index])
     square = pd.concat([pd.Series([0.0]), squares, parts.transform("mean")])
-    count = np.concatenate([[1], np.ones(len(squares)), parts.transform("size")])
+    count = np.r_[1, np.ones(len(squares)), parts.transform("size")]
     beyond = square.where(size * count * square > scipy.stats.chi2.isf(RARE, size * count), 0.0)
-    return "fixes are off", float(beyond.max() ** 0.5), float(t[beyond.idxmax()])
+    return "fixes are off" * bool(beyond.any()), float(beyond.max() ** 0.5), float(t[beyond.idxmax()])

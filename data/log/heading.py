@@ -225,7 +225,7 @@ def integral(signal: Signal, at: Floats) -> Floats:
     time the signal leaps."""
     start = signal.t[0]
     ends = np.append(at, signal.t) - start
-    t = np.concatenate([[ends.min() - 1], signal.t - start, [ends.max() + 1]])
+    t = np.r_[ends.min() - 1, signal.t - start, ends.max() + 1]
     value = np.pad(signal.value, ((1, 1), (0, 0)), "edge")
     path = scipy.interpolate.BSpline(np.pad(t, 1, "edge"), value, 1).antiderivative()
     return np.asarray(path(at - start) - path(0.0))

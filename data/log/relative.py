@@ -263,7 +263,7 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
         some = rows[bad[:: len(bad) // MISFITS + 1]]
         steps, lags = links.step[some][:, None], np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
         then = (steps - np.round(lags / world.dt).astype(int)).clip(0, len(c.x) - 1)
-        places = np.concatenate([c.x[steps[:, 0]], c.x[then, other]], axis=1)  # of all, and of its own before and later
+        places = np.hstack([c.x[steps[:, 0]], c.x[then, other]])  # of all, and of its own before and later
         far = norm(places - c.x[steps, one], axis=2)
         miss = pd.DataFrame(abs(far - measured[some, None])).median().fillna(inf)
         best, ahead = int(miss.argmin()), nan

@@ -66,7 +66,8 @@ class Number:
     def apply(self, make: Callable[..., Any], *others: "Number | float", kind: Any = None) -> "Number":
         """What an LLVM instruction makes of this number and others, a vector if one of them is."""
         numbers = [
-            n if isinstance(n, Number) else Number(types.float64, self.build, _constant(n)) for n in (self, *others)
+            n if isinstance(n, Number) else Number(types.float64, self.build, ir.Constant(ir.DoubleType(), n))
+            for n in (self, *others)
         ]
         batched = any(n.kind is BATCHED for n in numbers)
         own = kind or (BATCHED if batched else types.float64)
@@ -129,10 +130,6 @@ class Number:
 Numbers: TypeAlias = Sequence[Number]
 Lanes: TypeAlias = Any
 """What compiled code returns: a float, LANES of them side by side, or a tuple of such."""
-
-
-def _constant(number: float) -> Any:
-    return ir.Constant(ir.DoubleType(), number)
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,10 +72,11 @@ def constraint_rows(problem: Problem, x: Floats) -> Rows:
     """The constraints of a problem at x (n, ambient)."""
     items = problem.constraints
     part = problem.replace_unchecked(factors=tuple(map(as_factor, items)))
-    (linear, J), finite = linearised(part, x), np.concatenate([bounded(item).ravel() for item in items])
+    (linear, J), finite = linearised(part, x), stacked(bounded(item).ravel() for item in items)
+    values = [residual + item.middle for residual, item in zip(linear.residual, items, strict=True)]
     value, lower, upper = (
-        np.concatenate([side.ravel() for side in sides])[finite]
-        for sides in (linear.residual, [item.lower for item in items], [item.upper for item in items])
+        stacked(side.ravel() for side in sides)[finite]
+        for sides in (values, [item.lower for item in items], [item.upper for item in items])
     )
     origin = [np.insert(np.argwhere(bounded(item)), 0, k, axis=1) for k, item in enumerate(items)]
     return Rows(value, lower, upper, J[finite], np.concatenate(origin))

@@ -15,8 +15,8 @@ from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, Capabilities, SolverResult
-from ..model.derivatives import Structure, expressions
-from ..model.factor import stacked, steerable
+from ..model.derivatives import Structure, expressions, numbers_of
+from ..model.factor import as_factor, stacked, steerable
 from ..model.problem import Problem
 
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
@@ -83,19 +83,18 @@ def solver(
 
 
 def _numbers(problem: Problem, x: Floats) -> Floats:
-    """Parameters around x (n, ambient): x, numbers of the factors, constants of the constraints, and last by
-    what the cost is multiplied: 1 / max diag J^T J."""
+    """Parameters around x (n, ambient): x, numbers of the factors and constraints, and last by what the cost is
+    multiplied: 1 / max diag J^T J."""
     system = sparse(problem)
     curvature = system.quadratic(x, "gauss-newton")[2][system.entries.diagonal].max(initial=1e-12)
-    parts = [x.T, *system.numbers]
-    parts += [c.constants.T for c in problem.constraints if c.constants is not None]
+    parts = [x.T, *system.numbers, *(numbers_of(as_factor(c)) for c in problem.constraints)]
     return np.concatenate([*(part.ravel() for part in parts), [1.0 / curvature]])
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
     """Lower and upper sides of the numbers that are bounded and can change."""
-    kept = [(c, steerable(c, problem.movable)) for c in problem.constraints]
-    return stacked(c.lower[which] for c, which in kept), stacked(c.upper[which] for c, which in kept)
+    kept = [(c, c.middle, steerable(c, problem.movable)) for c in problem.constraints]
+    return stacked((c.lower - m)[which] for c, m, which in kept), stacked((c.upper - m)[which] for c, m, which in kept)
 
 
 def _exponential(step: Floats, dimension: int) -> Floats:

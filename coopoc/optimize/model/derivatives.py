@@ -164,8 +164,8 @@ def robust(square: Any, loss: Loss | None) -> Any:
 
 
 def expressions(structure: Structure) -> dict[str, Any]:
-    """CasADi's x (the free steps), p (centres, numbers of factors, constants of constraints), f (cost) and g (what
-    the constraints bound)."""
+    """CasADi's x (the free steps), p (centres, numbers of factors and of constraints), f (cost) and g (what the
+    constraints bound)."""
     import casadi as ca
 
     space, n = structure.space, structure.nodes
@@ -188,10 +188,8 @@ def expressions(structure: Structure) -> dict[str, Any]:
         for white in each(term, numbers[-1]):
             cost += 0.5 * robust(ca.sumsqr(white), term.kind.loss)
     for term in structure.constraints:
-        z_width, constants, size = term.kind.widths
-        numbers.append(ca.SX.sym("number", len(term.nodes), constants))
-        plain = ca.horzcat(ca.SX.zeros(len(term.nodes), z_width), numbers[-1], ca.SX.ones(len(term.nodes), size))
-        value = ca.vertcat(*each(term, plain))
+        numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
+        value = ca.vertcat(*each(term, numbers[-1]))
         bounds.append(value[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
     f, g = ca.cse([ca.SX(cost), ca.vertcat(*bounds)])  # a node's turn is that of all its measurements
     return {"x": steps, "p": ca.veccat(centre, *numbers), "f": f, "g": g}

@@ -379,7 +379,8 @@ class Constraint:
     Args:
         kind: a registered measurement that is no comparison of poses.
         nodes: (M, arity).
-        lower: (M, size), (size,) or a number: m, rad, m/s; -inf, inf leave a side open.
+        lower: (M, size), (size,) or a number: m, rad, m/s; -inf, inf leave a side open. An angle counts within half a
+            turn of the middle of two bounds, so that [3, 3.3] holds -3; with an open side from -pi to pi.
         upper: as `lower`.
         constants: as in Factor.
 
@@ -427,15 +428,21 @@ class Constraint:
         """2 or 3, or None if the kind looks the same in both."""
         return fitting(self.measurement, self.lower.shape[-1])
 
+    @property
+    def middle(self) -> Floats:
+        """(M, size) that of two bounds of an angle, 0 elsewhere."""
+        both = np.isfinite([self.lower, self.upper]).all(axis=0) & self.measurement.angles(self.dimension or 3)
+        return np.asarray(np.where(both, [self.lower, self.upper], 0.0).mean(axis=0))
+
     def __repr__(self) -> str:
         return f"Constraint({self.lower.min()} <= {self.kind} <= {self.upper.max()} x {len(self.nodes)})"
 
 
 def as_factor(constraint: Constraint) -> Factor:
-    """The factor whose residual is h of a constraint, angles in [-pi, pi]."""
-    made, shape = object.__new__(Factor), constraint.lower.shape
-    made.__dict__.update(kind=constraint.kind, nodes=constraint.nodes, constants=constraint.constants)
-    made.__dict__.update(z=np.zeros(shape), std=np.ones((1, shape[1])), sqrt_information=None, loss=None, twice=False)
+    """The factor whose residual is h of a constraint less its middle, angles in [-pi, pi]."""
+    made, z = object.__new__(Factor), constraint.middle
+    same = {"kind": constraint.kind, "nodes": constraint.nodes, "constants": constraint.constants}
+    made.__dict__.update(same, z=z, std=np.ones((1, z.shape[1])), sqrt_information=None, loss=None, twice=False)
     return made
 
 

@@ -156,7 +156,7 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
     information = np.square(root).sum(axis=1) + UNMEASURED_WEIGHT
     variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
     if factor.measurement.compares_poses:
-        z = np.concatenate([space.position(z), to_orientation(space.rotation(z))], axis=1)
+        z = np.hstack([space.position(z), to_orientation(space.rotation(z))])
         turn = 1.0 / information[:, d:].mean(axis=1, keepdims=True)
-        variance = np.concatenate([variance, np.repeat(turn, space.angles, axis=1)], axis=1)
+        variance = np.hstack([variance, np.repeat(turn, space.angles, axis=1)])
     return z, variance[:, :, None] * np.eye(variance.shape[1])
