@@ -316,7 +316,7 @@ def wrong_fixes(gnss: Floats, fleet: Fleet, outliers: Outliers, seed: int, remov
     for r, column, jump in _of_vehicles("fixes", outliers.fixes, fleet, len(gnss), seed):
         up, around = 2.0 * jump.turn[:, 0] - 1.0, 2.0 * np.pi * jump.turn[:, 1]
         flat = np.sqrt(1.0 - up**2)
-        error = jump.size[:, None] * np.stack([flat * np.cos(around), flat * np.sin(around), up], axis=-1)
+        error = jump.size[:, None] * np.column_stack([flat * np.cos(around), flat * np.sin(around), up])
         gnss[r, jump.wrong, column] += nan if remove_outliers else error[jump.wrong]
     for r, column, gap in _of_vehicles("outages", outliers.outages, fleet, len(gnss), seed):
         gnss[r, gap.wrong, column] = nan

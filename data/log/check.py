@@ -203,7 +203,7 @@ def _axes(c: Check, column: int) -> str:
         return "heights of fixes fall where vz is positive: it counts upwards, so that scale=vz:-1 mends it."
     if not size or abs(np.vdot(driven, moved)) > LEAST_CORRELATION * size:
         return ""
-    both = np.stack([driven, driven.conj()], axis=1)  # swapped degrees have other lengths; one axis, both
+    both = np.column_stack([driven, driven.conj()])  # swapped degrees have other lengths; one axis, both
     (turn, mirror), *_ = lstsq(both, moved)
     if abs(mirror) > 2 * abs(turn) and norm(both @ [turn, mirror]) > LEAST_CORRELATION * length:
         return (

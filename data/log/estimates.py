@@ -12,6 +12,7 @@ from numpy.linalg import inv, lstsq, norm
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
+from coopoc.workers import progress_bar
 from coopoc.world.links import wrap
 
 from .motion import COURSE, MOVING, OF_FASTEST
@@ -106,7 +107,9 @@ def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, 
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
     count = min(DRIVE_PARTS, max(len(y) // 2, min(len(y), FEW_PARTS)))
-    changes = value - np.stack([fitted(every * count // len(y) != part) for part in range(count)])
+    changes = value - np.stack(
+        [fitted(every * count // len(y) != part) for part in progress_bar(range(count), "check", delay=2.0)]
+    )
     none.value[seen], none.error[seen] = value, np.where(np.any(x, axis=0), lasting(changes), inf)
     return none
 

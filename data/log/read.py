@@ -16,6 +16,7 @@ from coopoc.arrays import Floats, instance, named, number, one_of, texts
 from coopoc.errors import suggestion
 from coopoc.paths import given_path
 from coopoc.text import short_repr
+from coopoc.workers import progress_bar
 from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
 from coopoc.world.recording import NOTHING_SIMULATED
@@ -247,7 +248,10 @@ def read_log(
     arms, tags = (each if isinstance(each, Mapping) else dict.fromkeys(ids, each) for each in (antenna, tag))
     for option, each in (("antenna", arms), ("tag", tags)):
         columns_of(option, [*named(option, each, f"Give {option}={{name: (forward, left, up)}}.")], ids)
-    members = {name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name)) for name in ids}
+    members = {
+        name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name))
+        for name in progress_bar(ids, "read", delay=2.0)
+    }
     if tag is not None:
         summary.assume("ranges are between tags, which only pose filters (frame=body) take off")
     at: Any = [np.zeros(3) if part.stands or tags.get(name) is None else tags[name] for name, part in members.items()]

@@ -93,7 +93,7 @@ def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
 
 def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
     """(u, K) A^-1 right, column by column."""
-    return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
+    return np.column_stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T])
 
 
 def with_still(matrix: Any, added: Floats | Bools) -> Any:

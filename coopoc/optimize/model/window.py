@@ -55,10 +55,10 @@ def drive_factors(
     before = np.where(step > 0, number[step - 1, member], -1)
     stays = before >= 0
     moved = recording.dt * recording.velocity[run, step, member]
-    ends = np.stack([number[links.step[link], end[link]] for end in (links.observer, links.neighbour)], axis=1)
+    ends = np.column_stack([number[links.step[link], end[link]] for end in (links.observer, links.neighbour)])
     return (
         *_measured("position", here[:, None], recording.gnss[run, step, member], fix_std),
-        *_measured("displacement", np.stack([before, here], axis=1)[stays], moved[stays], motion_std[stays]),
+        *_measured("displacement", np.column_stack([before, here])[stays], moved[stays], motion_std[stays]),
         *_relative(ends, relative, sensors),
     )
 
@@ -89,7 +89,7 @@ def relative_std(relative: Floats, sensors: Sensors) -> Floats:
     ratio = np.fmax(sensors.min_range / relative[:, 0], 1.0)
     if (ratio == 1.0).all():
         return sensors.relative_std
-    scale = np.stack([np.ones_like(ratio), ratio, ratio], axis=1)
+    scale = np.column_stack([np.ones_like(ratio), ratio, ratio])
     return np.minimum(scale * sensors.relative_std, [np.inf, np.pi, np.pi])
 
 

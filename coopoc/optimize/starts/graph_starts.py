@@ -151,7 +151,7 @@ def tree(graph: Graph) -> Floats:
     at = space.position(with_points(graph, position, rotation, reached))
     (i, j), moved = np.concatenate([each.nodes for each in kinds]).T, np.concatenate([each.position for each in kinds])
     variance = np.concatenate([position_variance(each, d) for each in kinds])
-    places, _ = averaging(np.stack([i, j], axis=1), variance, len(at), held)
+    places, _ = averaging(np.column_stack([i, j]), variance, len(at), held)
     return space.join(at + places(at[j] - at[i] - (rotation[i] @ moved[..., None])[..., 0]), rotation)
 
 
