@@ -234,9 +234,10 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
     accepted = [name for name in inspect.signature(read).parameters if name != "path"]
     if "options" in accepted:
         accepted[accepted.index("options") :] = ["dt", "max_gap", "any_scale"]
+    accepted += ["since", "until"]
     for name in options:
         if name not in accepted:
-            raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
+            raise unknown("option", name, accepted, suggestion(name, accepted, "Leave it out."))
     if not (path.is_file() or path.is_dir()):
         raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
     for each in (path, *path.rglob("*")):

@@ -1,6 +1,7 @@
 """Training of recipes: `train_all` makes every checkpoint that a study needs, or finds it."""
 
 import os
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -82,9 +83,7 @@ def train_all(
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     wanted = [job for name in recipes for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
     paths = {job: out / f"{job.label}.safetensors" for job in wanted}
-    missing = [
-        job for job, path in paths.items() if not (path.is_file() and read_card(path).get("key") == job.key(fleet))
-    ]
+    missing = [job for job, path in paths.items() if not path.is_file() or _key(path) != job.key(fleet)]
     if missing:
         made_folder(out)
     if jobs > 1 and len(missing) > 1:
@@ -107,23 +106,28 @@ def train_all(
 def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> None:
     """Train and save a checkpoint."""
     checkpoint = trained(job, fleet, progress)
-    if worst < inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
+    ours, theirs = checkpoint.card["validation_m"]
+    if ours > worst * theirs:
         allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
         hint = "Give more data or another recipe; --worse saves it all the same."
-        raise InputError(f"validation error of {job.label}", f"{times:.2f} times", allowed, hint)
-    save(out / f"{job.label}.safetensors", checkpoint)
+        raise InputError(f"validation error of {job.label}", f"{ours / theirs:.2f} times", allowed, hint)
+    path = out / f"{job.label}.safetensors"
+    if path.is_file() and _key(path) != checkpoint.card["key"]:
+        kept = path.rename(path.with_suffix(f".{_key(path)[:8]}{path.suffix}"))
+        print(f"coopoc: what was trained otherwise is kept as {kept}", file=sys.stderr)
+    save(path, checkpoint)
 
 
 def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
     """The checkpoint of a job, trained now."""
     data = job_clients(job, fleet)
     made = TRAINERS[job.recipe.kind](job, data, f"train {job.name}" if progress else None)
-    return replace(made, card=_card(job, fleet, data) | dict(made.card))
+    errors = {"validation_m": errors_beside_fitted_filter(made.model, data)}
+    return replace(made, card=_card(job, fleet, data) | errors | dict(made.card))
 
 
-def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
-    """Rms error on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
-    data = job_clients(job, fleet)
+def errors_beside_fitted_filter(model: Gain, data: Sequence[Client]) -> tuple[float, float]:
+    """Rms errors m on validation pieces: of a model, and of a Kalman filter with noise fitted on training pieces."""
     training, validation = (_joined(data, part) for part in ("training", "validation"))
     motions = training.truth.diff(dim=1) - training.dt * training.velocity[:, 1:]
     process, gnss = (
@@ -131,14 +135,18 @@ def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
         for off in (motions, training.gnss - training.truth)
     )
     fitted = NoiseParameters().with_logs(torch.stack([process, torch.full((3,), LEAST_STD), gnss]).log())
-    ours, theirs = (float(Judge([[validation]], net)(flatten([net]))) for net in (model, fitted))
-    return sqrt(ours / theirs)
+    ours, theirs = (sqrt(Judge([[validation]], net)(flatten([net]))) for net in (model, fitted))
+    return ours, theirs
 
 
 def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
     leave_with(parent)
     LINE.set(line or 0)
     _train(job, fleet, out, worst, line is not None)
+
+
+def _key(path: Path) -> str:
+    return str(read_card(path).get("key"))
 
 
 def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:

@@ -100,3 +100,5 @@ def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path):
         load_fleet(tmp_path / "a.csv", colums={})
     with refused("vehicle_lenght"):
         load_fleet(tmp_path / "a.csv", vehicle_lenght=4)
+    with refused(r"'untl': .* Did you mean until\?"):
+        load_fleet(tmp_path / "a.csv", untl=4)

@@ -49,9 +49,8 @@ def constant_velocity(
     """
     count, models = len(t), len(bank)
     velocity, growth, spread, proved = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count)
-    x, u = np.zeros((models, 3)), np.zeros((models, 3))
-    p, score, prior = np.zeros((models, 3)), np.zeros((models, 3)), PRIOR_COUNT
-    v, best = np.zeros(3), FIRST_FILTER
+    x, u, p, score = np.zeros((4, models, 3))
+    v, best, prior = np.zeros(3), FIRST_FILTER, PRIOR_COUNT
     score[:, 0], score[:, 1] = prior, prior * variance
     for j in range(count):
         dt = t[j] - t[j - 1] if j > 0 else math.inf

@@ -224,19 +224,19 @@ class Recording:
         """
         check_steps(start, stop, 0)
         kept = np.flatnonzero((self.links.step >= start) & (self.links.step < stop))
-        links, arrival, body = self.links, self.arrival[:, kept], self.body
+        part, links, arrival, body = slice(start, stop), self.links, self.arrival[:, kept], self.body
         return replace(
             self,
-            t=self.t[start:stop],
-            gnss=self.gnss[:, start:stop],
-            velocity=self.velocity[:, start:stop],
+            t=self.t[part],
+            gnss=self.gnss[:, part],
+            velocity=self.velocity[:, part],
             links=Links(links.step[kept] - start, links.observer[kept], links.neighbour[kept]),
             relative=self.relative[:, kept],
-            broadcasts=self.broadcasts[start:stop],
+            broadcasts=self.broadcasts[part],
             arrival=np.where((arrival >= 0) & (arrival < stop), arrival - start, -1),
-            body=body and Body(body.yaw_rate[:, start:stop], body.heading[:, start:stop]),
-            fix_factor=self.fix_factor[start:stop],
-            motion_variance=self.motion_variance[start:stop],
+            body=body and Body(body.yaw_rate[:, part], body.heading[:, part]),
+            fix_factor=self.fix_factor[part],
+            motion_variance=self.motion_variance[part],
         )
 
     def stretches(self, vehicle: int | str, shortest: int = 2, fixed: bool = True) -> tuple[tuple[int, int], ...]:

@@ -105,17 +105,17 @@ def step(
     t: int,
 ) -> None:
     """One step of all members: prediction, then each one's fix and compass, then the relative measurements."""
-    d = noise.d
+    d, members, active = noise.d, measured.own.shape[2], measured.active[t]
     if t == 0:
         poses.totals[COST] = poses.totals[USED] = 0.0
         poses.x[:], poses.cov[:] = 0.0, 0.0
-        for i in range(d * measured.own.shape[2] + 1, len(poses.x)):
+        for i in range(d * members + 1, len(poses.x)):
             poses.cov[i, i] = OF_PAIRS * OF_PAIRS * noise.lasting[2]
-    for k in range(measured.own.shape[2]):
+    for k in range(members):
         own, member = measured.own[run, t, k], d * k
-        if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
+        if active[k] and t > 0 and measured.active[t - 1, k]:
             predict(poses, faults[k], member, d, own[4:7], own[7], measured.dt, noise)
-        elif measured.active[t, k]:
+        elif active[k]:
             join(poses, member, d, own, noise)
             for pace in range(faults.shape[1]):
                 for i in range(SIZE):
@@ -127,15 +127,15 @@ def step(
                 if not math.isnan(begin[run, again, k, i]):
                     poses.x[member + i] = begin[run, again, k, i]
                     poses.cov[member + i, member + i] = spread[i] * spread[i]
-    for k in range(measured.own.shape[2]):
+    for k in range(members):
         own = measured.own[run, t, k]
-        if measured.active[t, k] and not math.isnan(own[0]):
+        if active[k] and not math.isnan(own[0]):
             if not math.isnan(own[3]):  # else it may be the heading that is wrong
                 lost = judge(faults[k], own[0], own[1], 0.5 * (noise.fix[0] + noise.fix[1]), measured.dt)
                 poses.cov[d * k, d * k] += lost
                 poses.cov[d * k + 1, d * k + 1] += lost
             update_fix(poses, d * k, own, noise.fix, noise.gate)
-        if measured.active[t, k] and not math.isnan(own[3]):
+        if active[k] and not math.isnan(own[3]):
             update_heading(poses, d * k, own[3], noise.heading, noise.gate)
     apply_pending_rows(poses)
     if measured.first[t] == measured.first[t + 1]:

@@ -404,8 +404,7 @@ class Constraint:
         if measurement.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
         limits = {name: checked(name, getattr(self, name)) for name in ("lower", "upper")}
-        sizes = [side.shape[-1] for side in limits.values() if side.ndim]
-        size = max(sizes, default=measurement.size())
+        size = max([side.shape[-1] for side in limits.values() if side.ndim], default=measurement.size())
         fitting(measurement, size)
         for name, side in limits.items():
             try:
@@ -453,5 +452,4 @@ def bounded(constraint: Constraint) -> Bools:
 
 def steerable(constraint: Constraint, movable: Bools) -> Bools:
     """(M, size) True where a side is finite and a node can move, `movable` (n, dof): the rows that a solver gets."""
-    moves = np.asarray(movable[constraint.nodes].any(axis=(1, 2)))
-    return bounded(constraint) & moves[:, None]
+    return bounded(constraint) & np.asarray(movable[constraint.nodes].any(axis=(1, 2)))[:, None]
