@@ -100,8 +100,7 @@ def formation_fleet(vehicles: int = 11, steps: int = 901) -> Fleet:
     around = np.linspace(0, 2 * pi, vehicles - 1, endpoint=False)
     gap = np.linspace(22.0, 22.1, vehicles - 1)
     offset = np.vstack([np.zeros(3), np.c_[gap * np.cos(around), gap * np.sin(around), 0 * gap]])
-    position = path[:, None] + offset
-    return moving("v", t, position)
+    return moving("v", t, path[:, None] + offset)
 
 
 def crossing_fleet() -> Fleet:
@@ -110,8 +109,7 @@ def crossing_fleet() -> Fleet:
     start = rng.uniform(-30, 30, (8, 3)) * [1, 1, 0.1]
     speed = rng.normal(0, 6, (8, 3)) * [1, 1, 0.05]
     wobble = np.sin(t[:, None, None] + np.arange(8)[:, None])
-    position = start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1]
-    return moving("c", t, position)
+    return moving("c", t, start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1])
 
 
 def without(fleet: Fleet, *away: tuple[slice, int | slice]) -> Fleet:

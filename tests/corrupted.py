@@ -116,8 +116,7 @@ def rearranged(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
         return view
 
     def unaligned(array):
-        raw = np.zeros(array.nbytes + 1, np.uint8)[1:]
-        view = raw.view(array.dtype).reshape(array.shape)
+        view = np.zeros(array.nbytes + 1, np.uint8)[1:].view(array.dtype).reshape(array.shape)
         view[...] = array
         view.flags.writeable = False
         return view

@@ -218,8 +218,7 @@ def test_pose_bounds_equal_gtsam_marginals(masts, compass):
     """A graph up to step t gives the filtering bound at t; GTSAM's covariance is of a step in the body."""
     fleet, sensors = convoy(4, 16, masts), replace(NOISE, compass=compass)
     flat = co.Fleet(fleet.ids, fleet.t, fleet.position * [1, 1, 0], fleet.velocity)
-    marks = [name for name in fleet.ids if name[0] == "m"]
-    found = co.pose_bound(flat, sensors, NEAR, landmarks=marks)[:, 0]
+    found = co.pose_bound(flat, sensors, NEAR, landmarks=[name for name in fleet.ids if name[0] == "m"])[:, 0]
     for t in (0, 5, 15):
         marginal = pose_marginals(flat, t + 1, sensors).marginalCovariance(node(0, t))
         world = block_diag(gtsam.Rot2(true_heading(flat)[t, 0]).matrix(), 1.0)

@@ -49,8 +49,7 @@ def test_star_filters_get_rows_on_convoys(tmp_path):
     assert benchmark.benchmark(("joint", "kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
     joint, alone = (json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "kalman"))
     recording, fleet = roads.convoy("convoy-kitti", measured())
-    track = co.JointFilter()(recording, recording.ids)
-    gap = (track.x - fleet.position)[..., :2]
+    gap = (co.JointFilter()(recording, recording.ids).x - fleet.position)[..., :2]
     assert joint["rt_le_m"][0] == pytest.approx(np.sqrt(np.vecdot(gap, gap).mean()), rel=0.15)  # a mean over blocks
     assert joint["rt_le_m"][0] < alone["rt_le_m"][0]
     assert (joint["received_bytes_per_second"] > 0, alone["received_bytes_per_second"]) == (True, 0)

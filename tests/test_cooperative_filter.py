@@ -181,8 +181,7 @@ def test_wheels_that_slip_leave_the_way_as_it_is(most, factor):
         seen = observe(fleet, sensors, V2X(most), runs=4, seed=3, observers=[ego])
         velocity = seen.velocity.copy()
         velocity[:, 200:250, ego] *= factor
-        slipping = replace(seen, velocity=velocity)
-        ours, joint = mean_errors(slipping, fleet, [ego], JointFilter())
+        ours, joint = mean_errors(replace(seen, velocity=velocity), fleet, [ego], JointFilter())
         assert ours < min(0.7, 1.05 * joint)
 
 
@@ -205,11 +204,15 @@ def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step):
 )
 def test_a_wrong_start_is_left_soon_after_it(most, std, off):
     """Law: fixes that are wrong for the first 10 s leave the ego where it is 10 s later. Beside one neighbour it stayed
-    off for good, neither receiver being trusted; alone it turned its odometry until it met the fixes."""
+    off for good, neither receiver being trusted; alone it turned its odometry until it met the fixes. If its fixes
+    stay wrong, one neighbour does not tell which receiver errs, and the covariance has room for both."""
     fleet = load_fleet("town10").between(0, 300)
     seen = observe(fleet, replace(S2, gnss_std=(std,) * 3), V2X(most, radius=100.0), runs=3, seed=7, observers=[24])
-    track = CooperativeFilter()(moved(seen, slice(100), 24, [0.8 * off, -0.6 * off, 0.0]), [24])
+    track, always = (
+        CooperativeFilter()(moved(seen, slice(until), 24, [0.8 * off, -0.6 * off, 0.0]), [24]) for until in (100, 300)
+    )
     assert errors(track, fleet)[:, 200:].max() < 2.0 + std
+    assert most != 1 or off > 30.0 or np.median(nees(always, fleet)) < 15.0
 
 
 @pytest.mark.parametrize("step", [1, 10])
@@ -281,8 +284,7 @@ def test_receivers_that_all_jump_alike_are_not_followed_for_seconds(seed):
     drawn = world(seed, "validation")
     wrong, dt = drawn.recording, drawn.recording.dt
     for second in (10, 24, 36):
-        steps = slice(int(second / dt), int((second + 3) / dt))
-        wrong = moved(wrong, steps, slice(None), [20.0, -10.0, 0.0])
+        wrong = moved(wrong, slice(int(second / dt), int((second + 3) / dt)), slice(None), [20.0, -10.0, 0.0])
     ours, alone = mean_errors(wrong, drawn.fleet, drawn.egos, Kalman())
     assert ours < 1.5 * alone
 
@@ -406,8 +408,7 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
 def test_the_filter_is_its_oracle(crossing, case, priors):
     """Against dense matrices, one number at a time; members come, go and lose trust."""
     sensors, v2x, change = BAD[case]
-    fleet = gappy(crossing)
-    seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
+    seen = change(observe(gappy(crossing), sensors, v2x, runs=2, observers=[0]))
     track = CooperativeFilter(priors=priors)(seen)
     assert (track.extras["alone"] > 0).any() == (case == "mirrored" and priors == Priors())
     assert_is_the_oracle(track, seen, ON_ROADS if seen.measured and priors == Priors() else priors)
@@ -497,8 +498,7 @@ def test_an_odometry_that_is_mirrored_is_asked_about_again():
     """It was not, once fixes were taken to drift for a moment: 19 m."""
     fleet = drive(300)
     seen = observe(fleet, Sensors(), V2X(0), seed=5, observers=[0, 2])
-    mirrored = replace(seen, velocity=seen.velocity * (1, -1, 1))
-    ours, kalman = mean_errors(mirrored, fleet, [0, 2], Kalman())
+    ours, kalman = mean_errors(replace(seen, velocity=seen.velocity * (1, -1, 1)), fleet, [0, 2], Kalman())
     assert ours < kalman
 
 

@@ -38,8 +38,7 @@ def drives() -> dict[str, tuple[Any, Any, float, float]]:
     out = {}
     for name, (start, radius, rate) in CARS.items():
         angle = start + rate * T
-        place = radius * np.c_[np.cos(angle), np.sin(angle)]
-        out[name] = place, wrapped(angle + pi / 2), radius * rate, rate
+        out[name] = radius * np.c_[np.cos(angle), np.sin(angle)], wrapped(angle + pi / 2), radius * rate, rate
     return out
 
 
@@ -310,8 +309,7 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path, wheels):
     assert_allclose(log.truth.position[:, ego, :2], place, atol=1e-9)
     noise = log.recording.sensors
     assert (noise.range_std, noise.yaw_rate_std) == pytest.approx((0.1, np.sqrt(2e-4) / 0.2 if wheels else 0.01))
-    begin = co.pose_start(log.recording)
-    track = co.PoseFilter("solo", begin=begin)(log.recording, ["Hall"])
+    track = co.PoseFilter("solo", begin=co.pose_start(log.recording))(log.recording, ["Hall"])
     assert norm(track.x[0, 50:, 0, :2] - place[50:], axis=1).max() < 0.15
     assert abs(wrapped(track.heading[0, 50:, 0] - heading[50:])).max() < 0.05
     with refused("where ranges to anchors place it"):

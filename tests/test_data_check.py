@@ -90,8 +90,7 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path):
     folder = cars(tmp_path / "log", lambda f: f.assign(range=1000 * (f["range"] + 2)))
     log = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"range": 2.0})
     assert said(log) == ""
-    plain = read_log(cars(tmp_path / "plain"))
-    assert_allclose(log.recording.relative, plain.recording.relative, atol=1e-9)
+    assert_allclose(log.recording.relative, read_log(cars(tmp_path / "plain")).recording.relative, atol=1e-9)
     pair = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"car1-car0": 2.0, "range": 9.0})
     assert_array_equal(pair.recording.relative, log.recording.relative)
     with refused("offset = 'uwb': must be one of"):
@@ -217,8 +216,7 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
     log = read_log(write(frame, tmp_path / "car.csv"))
     assert np.isfinite(log.recording.gnss[0, :, 0, 0]).all()
     assert not log.summary.refused
-    still = ~moves & (t > 31)
-    assert_allclose(log.recording.velocity[0, still, 0], 0.0, atol=0.03)
+    assert_allclose(log.recording.velocity[0, ~moves & (t > 31), 0], 0.0, atol=0.03)
     frame.loc[~moves, "speed"] = nan  # a receiver that says nothing while it stands
     text = said(read_log(write(frame, tmp_path / "car.csv")))
     assert "mostly 14" in text

@@ -87,8 +87,7 @@ def cache(tmp_path, monkeypatch):
 
 def entry(name: str, files: dict[str, bytes], address: str = "", **more: str) -> Entry:
     rows = {f: (f"{address}/{f}", len(data), hashlib.sha256(data).hexdigest()) for f, data in files.items()}
-    page = "https://example.org/page"
-    return Entry(name, "a car", "MIT", "Nobody, 2026", page, "not tried", rows, **more)
+    return Entry(name, "a car", "MIT", "Nobody, 2026", "https://example.org/page", "not tried", rows, **more)
 
 
 @pytest.fixture
@@ -170,8 +169,7 @@ def test_no_network_and_a_missing_page_name_address_and_place(car, cache, server
         co.fetch("car")
     with refused("Did you mean car"):
         co.fetch("cra")
-    file = cache / "car" / ".lock"
-    monkeypatch.setenv("COOPOC_DATA", str(file))
+    monkeypatch.setenv("COOPOC_DATA", str(cache / "car" / ".lock"))
     with refused("COOPOC_DATA = .*must be a folder that can be written"):
         co.fetch("car")
     assert _status(["data", "get"]) == 2
@@ -277,8 +275,7 @@ def test_a_folder_of_several_drives_is_refused_and_lists_them(tmp_path):
 def test_vehicles_that_come_later_are_of_one_drive(tmp_path):
     rows = DRIVE.splitlines()
     (tmp_path / "a.csv").write_text("\n".join(rows[:2000]))
-    later = [row.replace(",a,", ",b,") for row in rows[2500:]]
-    (tmp_path / "b.csv").write_text("\n".join([rows[0], *later]))
+    (tmp_path / "b.csv").write_text("\n".join([rows[0], *[row.replace(",a,", ",b,") for row in rows[2500:]]]))
     assert co.read_log(tmp_path).recording.ids == ("a", "b")
 
 

@@ -25,8 +25,7 @@ from coopoc.evaluate.metrics import nees
 def test_a_recording_comes_back_from_its_rows(tmp_path, suffix):
     """Fixes, velocities, relative measurements and messages; late and lost ones, too. Velocities are means over steps
     of samples joined by lines, so those of the rows are made such that their means are the recording's."""
-    fleet = drive(start=1.7e9)
-    true = observed(fleet, rate=5.0, latency=0.25, loss=0.2)
+    true = observed(drive(start=1.7e9), rate=5.0, latency=0.25, loss=0.2)
     frame = long(true)
     log = read_log(write(frame, tmp_path / f"log.{suffix}"))
     found = log.recording
@@ -44,8 +43,7 @@ def test_a_recording_comes_back_from_its_rows(tmp_path, suffix):
     assert_array_equal(one, other)
     order, back = one.index, other.index
     assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
-    sent = true.broadcasts[true.links.step, true.links.neighbour]
-    wanted = np.where(sent, true.arrival[0], -1)
+    wanted = np.where(true.broadcasts[true.links.step, true.links.neighbour], true.arrival[0], -1)
     assert_array_equal(found.arrival[0, back], wanted[order])
     assert found.sensors == replace(
         NOISE, min_range=0.0, range_offset_std=1.0, velocity_floor=found.sensors.velocity_floor
@@ -194,8 +192,7 @@ def test_a_clock_that_is_ahead_is_set_back(tmp_path):
 def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path):
     frame = long(observed(drive(3)), messages=False)
     gone = (frame["vehicle"] == "car2") & (frame["t"] > 5.02) & (frame["t"] < 12.02)
-    odometry = frame["kind"].isin(["vx", "vy", "vz"])
-    log = read_log(write(frame[~(gone & odometry)], tmp_path / "log.csv"))
+    log = read_log(write(frame[~(gone & frame["kind"].isin(["vx", "vy", "vz"]))], tmp_path / "log.csv"))
     rec, refused = log.recording, log.summary.refused
     absent = np.isnan(rec.velocity[0, :, 2, 0])
     assert np.flatnonzero(absent)[[0, -1]].tolist() == [52, 119]

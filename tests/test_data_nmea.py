@@ -54,8 +54,7 @@ def test_nmea_is_fixes_speed_and_course(tmp_path):
     start = datetime(2024, 2, 28, 23, 59, 55)
     for column, name in enumerate("ab"):
         (tmp_path / f"{name}.nmea").write_text(nmea(fleet, column, start))
-    log = read_log(tmp_path, origin=(48.14, 11.58, 560.0))
-    rec = log.recording
+    rec = read_log(tmp_path, origin=(48.14, 11.58, 560.0)).recording
     assert_allclose(rec.gnss[0], fleet.position, atol=1e-3)
     assert_allclose(rec.velocity[0, 2:], fleet.velocity[2:], atol=0.05)
     assert rec.t[0] == pytest.approx((start - datetime(1970, 1, 1)).total_seconds())
@@ -72,8 +71,7 @@ def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path):
     fleet, start = drive(1, steps=100), datetime(2024, 2, 28, 12)
     (tmp_path / "a.nmea").write_text(nmea(fleet, 0, start))
     (tmp_path / "truth.gga").write_text(nmea(fleet, 0, start, rmc=False))
-    log = read_log(tmp_path, origin=(48.14, 11.58, 560.0))
-    assert_allclose(log.truth.position, fleet.position, atol=1e-3)
+    assert_allclose(read_log(tmp_path, origin=(48.14, 11.58, 560.0)).truth.position, fleet.position, atol=1e-3)
     (tmp_path / "truth.gga").write_text(nmea(fleet, 0, start + timedelta(hours=2), rmc=False))
     with refused(r"truth\.gga: column t = .*must overlap the log, .*Does its clock"):
         read_log(tmp_path)
@@ -217,8 +215,7 @@ def test_motion_capture_and_radios_of_a_public_bag():
 
 def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):
     pytest.importorskip("rosbags")
-    fleet = drive(1, steps=60, start=1.7e9)
-    write_bag(tmp_path / "drive", fleet, 2, late=0.25, invalid=40)
+    write_bag(tmp_path / "drive", drive(1, steps=60, start=1.7e9), 2, late=0.25, invalid=40)
     by_header, received = (read_log(tmp_path / "drive", dt=0.1, stamps=stamps) for stamps in ("header", "received"))
     assert received.recording.t[0] - by_header.recording.t[0] == pytest.approx(0.25, abs=1e-5)
     assert "times are by stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)

@@ -201,8 +201,7 @@ def test_interpolation_agrees_with_pandas():
 
 def test_degrees_are_not_metres(tmp_path):
     t = np.arange(0, 5, 0.1)
-    degrees = {"x": 11.58 + 1e-5 * t, "y": 48.14 + 4e-5 * t}
-    drive(t).assign(**degrees).to_csv(tmp_path / "a.csv")
+    drive(t).assign(**{"x": 11.58 + 1e-5 * t, "y": 48.14 + 4e-5 * t}).to_csv(tmp_path / "a.csv")
     with refused(r"columns x, y = 11\.58\.\.11\.58.*look like degrees.*read_log"):
         load_fleet(tmp_path / "a.csv")
     assert load_fleet(tmp_path / "a.csv", any_scale=True).position[0, 0, 1] == 48.14

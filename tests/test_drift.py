@@ -80,8 +80,7 @@ def test_bound_of_a_single_vehicle_is_the_riccati_equations():
 def test_rms_and_nees_agree_with_the_bound():
     fleet, v2x = convoy(), V2X(3, 25.0)
     for sensors in (OWN, COMMON, BOTH):
-        seen = observe(fleet, sensors, v2x, runs=60, observers=[0])
-        track = CooperativeFilter(priors=AS_STATED)(seen, [0])
+        track = CooperativeFilter(priors=AS_STATED)(observe(fleet, sensors, v2x, runs=60, observers=[0]), [0])
         rms = float(np.sqrt(np.mean(rt_le(track, fleet) ** 2)))
         assert rms == pytest.approx(bound_rt_le(posterior_bound(fleet, sensors, 0, v2x)), rel=0.12)
         assert np.nanmean(nees(track, fleet)) == pytest.approx(3.0, abs=0.45)

@@ -25,8 +25,7 @@ def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_r
             gap = [float(np.sqrt(np.square(p - position[observer]).sum())) for p in position]
             fits = [(d, k) for k, d in enumerate(gap) if k != observer and min_range <= d <= radius]
             rows += [(t, observer, k) for _, k in sorted(fits)[:most]]
-    columns = np.array(rows, int).reshape(-1, 3).T
-    return Links(*columns)
+    return Links(*np.array(rows, int).reshape(-1, 3).T)
 
 
 def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float) -> int:
@@ -41,8 +40,7 @@ def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float) ->
 @pytest.mark.parametrize("radius", [0.0, 1e-3, 12.0, 30.0, np.inf])
 @pytest.mark.parametrize("observers", [[3], [1, 2, 7], range(8), []])
 def test_neighbours_are_those_of_brute_force(crossing, most, radius, observers):
-    fleet = coming_and_going(crossing).between(15, 45)
-    count = assert_same_links(fleet, observers, most, radius)
+    count = assert_same_links(coming_and_going(crossing).between(15, 45), observers, most, radius)
     assert (count > 0) == (most > 0 and radius >= 12 and len(observers) > 0)
 
 

@@ -138,8 +138,7 @@ def test_the_smoother_descends_where_whole_steps_lead_away():
         inclination_std=6e-4,
     )
     recording = observed(fleet, sensors, 6, 13)
-    settled = co.BatchSmoother()(recording, [0]).x
-    error = norm(off(settled, fleet), axis=-1)
+    error = norm(off(co.BatchSmoother()(recording, [0]).x, fleet), axis=-1)
     assert error.max() < 3.0 * abs(off(recording.gnss, fleet)).max()
 
 
@@ -189,8 +188,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain():
         fleet = co.Fleet(tuple("abcd"), t, position, velocity)
         seen = co.observe(fleet, sensors, co.V2X(5, radius=200.0), runs=3, seed=seed)
         drives.append((fleet, without_azimuth(seen)))
-    names = "kalman joint lkf-sa-edge batch-smoother"
-    error = errors_of(names, "no azimuth put what is", drives)
+    error = errors_of("kalman joint lkf-sa-edge batch-smoother", "no azimuth put what is", drives)
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 
 

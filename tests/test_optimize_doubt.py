@@ -89,8 +89,7 @@ def test_a_race_ends_as_low_as_the_best_of_all_starts(seed):
 
 def test_covariances_of_many_nodes_are_computed_where_asked():
     """Also without them a free node is named, and the time that is printed is what was waited."""
-    graph = random_drive(5, steps=1100, loops=20)
-    problem = from_graph(graph)
+    problem = from_graph(random_drive(5, steps=1100, loops=20))
     plain, full = solve(problem), solve(problem, covariance=True)
     assert np.isnan(plain.covariance).all()
     assert "+-" not in str(plain)

@@ -183,8 +183,7 @@ def gtsams(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Levenber
 def test_no_minimum_lies_above_gtsams(seed):
     """From the same chained odometry, bad enough to matter, on graphs that GTSAM has every factor of."""
     graph = random_graph(seed, steps=120, seen=0, loops=40, ranges=120, turn_std=0.05)
-    problem = from_graph(graph, start="odometry")
-    native, theirs = gtsams(problem)
+    native, theirs = gtsams(from_graph(graph, start="odometry"))
     found = solve(from_graph(graph))
     assert found.status is Status.SOLVED
     assert found.cost <= native.error(theirs.optimize()) * (1 + 1e-9)
@@ -341,8 +340,7 @@ def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension):
     """Closed form: half a chi-square, whose angles count twice in the plane; mean and spread over 40 graphs."""
     found, known = [], (0.0, 0.0)
     for seed in range(40):
-        graph = random_drive(seed, dimension, loops=40)
-        problem = from_graph(graph, start="file")
+        problem = from_graph(random_drive(seed, dimension, loops=40), start="file")
         found.append(solve(problem, throw=False).cost)
         free = len(problem.names) - len(problem.fixed)
         known = expected(problem, free * problem.space.dof)
@@ -368,8 +366,7 @@ DATA = Path(gtsam.__file__).parent / "Data"
 def least(graph: Any, values: Any, first: Any) -> float:
     """Cost of GTSAM's Levenberg-Marquardt with the first pose where the file has it."""
     d = 3 if isinstance(first[1], gtsam.Pose3) else 2
-    all_of_it = gtsam.noiseModel.Constrained.All(3 * (d - 1))
-    graph.add(getattr(gtsam, f"PriorFactorPose{d}")(*first, all_of_it))
+    graph.add(getattr(gtsam, f"PriorFactorPose{d}")(*first, gtsam.noiseModel.Constrained.All(3 * (d - 1))))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-12)
     parameters.setAbsoluteErrorTol(1e-12)

@@ -88,12 +88,10 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
 
 def test_a_turned_world_turns_the_estimate():
     """What is measured between bodies does not depend on the world: only the held pose turns, and all with it."""
-    graph = small()
-    problem = from_graph(graph, start="file")
+    problem = from_graph(small(), start="file")
     turn, shift, space = exp(np.array([0.7])), np.array([30.0, -4.0]), problem.space
     moved = space.join(problem.x0[:, :2] @ turn.T + shift, turn @ space.rotation(problem.x0))
-    there = replace(problem, x0=moved, search=Search(x0=moved))
-    a, b = solve(problem), solve(there)
+    a, b = solve(problem), solve(replace(problem, x0=moved, search=Search(x0=moved)))
     assert b.cost == pytest.approx(a.cost, abs=1e-12)
     assert b.position == pytest.approx(a.position @ turn.T + shift, abs=1e-6)
 
@@ -163,8 +161,7 @@ def test_poses_without_an_x0_are_found(kind, of, d):
     gap = np.array([relative(space, truth, pair)[:d] for pair in pairs])
     if lookup(kind).frame == "world":
         gap = truth[n:, :d][np.arange(n) % 4] - truth[:n, :d]
-    seen = lookup(kind).predict(gap)
-    solution = solve(problem.add(kind, pairs, seen, std=0.02))
+    solution = solve(problem.add(kind, pairs, lookup(kind).predict(gap), std=0.02))
     assert solution.x[:, :d] == pytest.approx(truth[:, :d], abs=1e-3)
 
 
@@ -200,8 +197,7 @@ def test_offsets_that_ranges_share_are_scipys(backend):
 
     theirs = least_squares(residual, np.append(path, [0.0, 0.0]), xtol=1e-14, gtol=1e-12)
     names = [*map(str, range(steps)), "A", "B", "offset A", "offset B"]
-    x0 = np.concatenate([path, anchors, np.zeros((2, 2))])
-    problem = Problem(names, x0=x0, dimension=2, fixed="AB").add(
+    problem = Problem(names, x0=np.concatenate([path, anchors, np.zeros((2, 2))]), dimension=2, fixed="AB").add(
         "displacement", [*pairwise(names[:steps])], moved, 0.05
     )
     problem = problem.add(

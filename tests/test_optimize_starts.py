@@ -94,8 +94,7 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
         else:
             problem = problem.add("range", pairs[:, :2], z, std=0.2)
         if case == "ranges and azimuths":
-            azimuths = np.arctan2(apart[:, 1], apart[:, 0])
-            problem = problem.add("azimuth", pairs[:, :2], azimuths, std=0.05)
+            problem = problem.add("azimuth", pairs[:, :2], np.arctan2(apart[:, 1], apart[:, 0]), std=0.05)
         found = solve(problem, throw=False)
         starts = truth + 20.0 * rng.normal(size=(12, nodes, 3))
         costs = [solve(replace(problem, x0=x), throw=False).cost if loss else scipys(problem, x).cost for x in starts]
@@ -198,14 +197,12 @@ def ring(n: int, wrong: float) -> Graph:
     edge, turn = np.c_[np.arange(n), np.roll(np.arange(n), -1)], (2 * pi + wrong) / n
     moved = PoseEdges(edge, np.tile([1.0, 0], (n, 1)), np.full((n, 1), turn), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     names = tuple(f"A{k}" for k in range(n))
-    nan = np.full((n, 2), np.nan)
-    return Graph(2, names, np.ones(n, bool), nan, np.zeros((n, 1)), relative_pose=moved)
+    return Graph(2, names, np.ones(n, bool), np.full((n, 2), np.nan), np.zeros((n, 1)), relative_pose=moved)
 
 
 def test_the_tree_shares_what_a_loop_does_not_close():
     """Of a ring with equal variances every turn takes the same part; against that closed form."""
-    graph = ring(8, 0.4)
-    turn = Space(2, has_rotation=True).rotation(tree(graph))
+    turn = Space(2, has_rotation=True).rotation(tree(ring(8, 0.4)))
     moved = turn.mT @ np.roll(turn, -1, axis=0)
     assert np.arctan2(moved[:, 1, 0], moved[:, 0, 0]) == pytest.approx(2 * pi / 8, abs=1e-9)
 
@@ -263,8 +260,7 @@ def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     drive, rng, sizes = world(0, 2, 1, 300), default_rng(1), list[int]()
     pairs = rng.integers(0, 300, (700, 2))
     pairs = pairs[abs(pairs[:, 0] - pairs[:, 1]) > 1][:600]
-    edges = drive.relative(drive.chain(), 0.1, 0.05)
-    graph = drive.graph(relative_pose=edges, ranges=drive.ranged(pairs, 0.1))
+    graph = drive.graph(relative_pose=drive.relative(drive.chain(), 0.1, 0.05), ranges=drive.ranged(pairs, 0.1))
 
     def counted(system, *rest, **options):
         end = arrive(system, *rest, **options)

@@ -41,8 +41,7 @@ def test_tracks_and_methods_show_their_sizes(recording):
 
 
 def test_solutions_show_status_and_cost(recording):
-    problem = co.Problem.from_snapshot(recording, step=20, ego=24)
-    solution = co.solve(problem)
+    solution = co.solve(co.Problem.from_snapshot(recording, step=20, ego=24))
     assert "status=SOLVED" in one_line(solution)
     assert f"cost={solution.cost:.6g}" in repr(solution)
 

@@ -23,8 +23,7 @@ SIZES = ("payload_bytes_per_second", "bytes_per_second")
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory, short_town):
-    wanted = {**QUICK, "data": short_town}
-    return run_study("budget", tmp_path_factory.mktemp("budget"), settings=wanted)
+    return run_study("budget", tmp_path_factory.mktemp("budget"), settings={**QUICK, "data": short_town})
 
 
 @pytest.fixture(scope="module")

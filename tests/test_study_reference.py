@@ -92,8 +92,7 @@ def test_verdicts_know_the_direction(results, tmp_path):
     off = changed(tmp_path / "off", shift=-0.5)
     assert verdicts(off, known)[1.0, "nees"] == "worse"
     assert verdicts(results, measure(off, METRICS))[1.0, "nees"] == "better"  # nearer to 3
-    found = check(off, known, METRICS)
-    shown = table(found)
+    shown = table(check(off, known, METRICS))
     assert shown.caption == "2 of 4 reference numbers hold; 2 worse."
     assert len(shown.rows) == 2
     assert not table(check(results, known, METRICS)).rows
@@ -102,8 +101,7 @@ def test_verdicts_know_the_direction(results, tmp_path):
 def test_other_runs_are_allowed_their_standard_errors(results, tmp_path):
     """3 runs against 12 whose mean is 1.55: 0.45 away, 2 x 0.1 sqrt(1/3 + 1/12) + 0.011 = 0.14 allowed."""
     known = measure(results, METRICS)
-    more = changed(tmp_path, runs=12)
-    first = check(more, known, METRICS)[0]
+    first = check(changed(tmp_path, runs=12), known, METRICS)[0]
     allowed = (first.difference.high - first.difference.low) / 2
     assert allowed == pytest.approx(0.01 * 1.1 + 2 * 0.1 * (1 / 3 + 1 / 12) ** 0.5, rel=1e-5)
     assert first.verdict == "worse"

@@ -225,14 +225,12 @@ def correct_drives(
     states, moved = np.empty((len(columns), *fresh.shape)), np.empty(3)
     fails = False
     for run in range(gnss.shape[0]):
-        for e in range(len(columns)):
-            for pace in range(len(fresh)):
-                for i in range(SIZE):
-                    states[e, pace, i] = fresh[pace, i]
+        states[:] = fresh
         for t in range(gnss.shape[1]):
             for e in range(len(columns)):
                 n, extra, state = columns[e], 0.0, states[e]
-                moved[0], moved[1] = velocity[run, t, n, 0], velocity[run, t, n, 1]
+                measured = velocity[run, t, n]
+                moved[0], moved[1] = measured[0], measured[1]
                 if math.isnan(moved[0]):
                     for i in range(len(state)):
                         state[i, PLACE] = math.nan
@@ -243,6 +241,6 @@ def correct_drives(
                 extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
                 if len(out):
-                    out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
-                    out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
+                    by = out[run, t, n]
+                    by[0], by[1], by[2] = moved[0] - measured[0], moved[1] - measured[1], extra
     return fails

@@ -115,13 +115,14 @@ def features(
     residual, lengths = net.columns.residual, net.columns.lengths
     s, first, lanes = rows
     for lane in range(lanes):
-        gone, own, b = missing(drives.gnss, (t, s, first + lane)), tape[row + lane], first + lane
+        own, b, x = tape[row + lane], first + lane, state.x[lane]
+        gone = missing(drives.gnss, (t, s, b))
         for i in range(3):
             fix = state.gnss_before[lane, i] if gone else drives.gnss[t, s, b, i]
-            innovation = fix - (state.x[lane, i] + drives.dt[t] * drives.velocity[t, s, b, i])
+            innovation = fix - (x[i] + drives.dt[t] * drives.velocity[t, s, b, i])
             own[at + i], own[at + 3 + i] = fix - state.gnss_before[lane, i], innovation
-            own[at + 6 + i] = state.x[lane, i] - state.x_before[lane, i]
-            own[at + 9 + i] = state.x[lane, i] - state.prior_before[lane, i]
+            own[at + 6 + i] = x[i] - state.x_before[lane, i]
+            own[at + 9 + i] = x[i] - state.prior_before[lane, i]
             own[residual + i] = innovation
         for change in range(4):
             c = at + 3 * change
@@ -172,21 +173,22 @@ def blend(unit: Floats, new: Floats) -> None:
         fresh = unit[FROM_X + 2 * CELLS + j] + unit[GATES + j] * unit[FROM_H + 2 * CELLS + j]
         unit[GATES + 2 * PAD + j] = tanh(fresh, real)
     for j in range(CELLS):
-        new[j] = unit[GATES + 2 * PAD + j] + unit[GATES + PAD + j] * (unit[j] - unit[GATES + 2 * PAD + j])
+        fresh = unit[GATES + 2 * PAD + j]
+        new[j] = fresh + unit[GATES + PAD + j] * (unit[j] - fresh)
 
 
 @part
 def correct(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: tuple[Index, Index, Index]) -> None:
     """x <- x_prior + K (z - x_prior) and the new states of a lane; without a fix x <- x_prior and nothing else."""
     t, s, b = at
-    gone, gain, residual = missing(drives.gnss, at), net.columns.gain, net.columns.residual
+    gone, gain, residual, x = missing(drives.gnss, at), net.columns.gain, net.columns.residual, state.x[lane]
     for i in range(3):
-        state.x_before[lane, i] = state.x[lane, i]
-        state.x[lane, i] += drives.dt[t] * drives.velocity[t, s, b, i]
+        state.x_before[lane, i] = x[i]
+        x[i] += drives.dt[t] * drives.velocity[t, s, b, i]
         if not gone:
-            state.prior_before[lane, i], state.gnss_before[lane, i] = state.x[lane, i], drives.gnss[t, s, b, i]
+            state.prior_before[lane, i], state.gnss_before[lane, i] = x[i], drives.gnss[t, s, b, i]
             for j in range(3):
-                state.x[lane, i] += tape[gain + 3 * i + j] * tape[residual + j]
+                x[i] += tape[gain + 3 * i + j] * tape[residual + j]
     if not gone:
         process, innovation, posterior = net.columns.process, net.columns.innovation, net.columns.posterior
         for j in range(CELLS):

@@ -212,8 +212,7 @@ class Oracle:
             )
             self.life = Life(*lasting, keep, bias, heading, offset, ranged, turn, holds, absent)
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
-        shape = seen.gnss.shape
-        self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
+        self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), seen.gnss.shape)[run]
         gnss = fresh(seen.gnss[run], seen.dt * seen.velocity[run], self.r)
         self.fix = gnss[:, ego]
         self.remember(gnss, seen.velocity[run])
@@ -287,6 +286,9 @@ class Oracle:
             more, white = max(self.lasting(t) - np.trace(cov), self.others()), self.r[t, self.ego] * self.white
             here = x, cov + more * np.diag(white / white.sum())
             b, way = self.state.belief, self.state.way
+            errors = [b.x[b.at("b", j)] for j in {self.ego, *self.state.members} - self.state.trusted]
+            if self.priors.forget and self.trusted() + (self.ego in self.state.trusted) < 2:
+                here[1][:] += sum(map(np.outer, errors, errors)) / 2
             at = [b.x[b.at("x", j)] + way[j] if j in way else np.full(3, nan) for j in self.neighbours(t)[1]]
             found.append((*here, at))
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
@@ -459,8 +461,7 @@ class Oracle:
         self.state.information[kind] += 0.5 * numbers * share**2
 
     def own_variance(self) -> Any:
-        at = self.state.belief.at("x", self.ego)
-        return np.diag(self.state.belief.p)[at].sum()
+        return np.diag(self.state.belief.p)[self.state.belief.at("x", self.ego)].sum()
 
     def corrected(self):
         """What the level of motion makes of the ego's variance, after an update."""
@@ -582,8 +583,7 @@ class Oracle:
         if self.priors.fix_gate and self.ego not in s.vague:
             self.go_back(t, fix, rows)
             rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
-        slip = self.may_slip(self.r[t, self.ego] * self.white, way**2)
-        s.share = self.use_fix(t, self.ego, rows, True, slip)
+        s.share = self.use_fix(t, self.ego, rows, True, self.may_slip(self.r[t, self.ego] * self.white, way**2))
         self.corrected()
 
     def keep_place(self, more: float):
@@ -762,8 +762,7 @@ class Oracle:
             return float(gap @ solve(v, gap))
 
         alike = {j: [k for k in heard if k == j or far(j, k) < FIX_GATE] for j in heard}
-        doubtless = [j for j in heard if far(j) > WILD]
-        best = max(doubtless, key=lambda j: len(alike[j]), default=None)
+        best = max([j for j in heard if far(j) > WILD], key=lambda j: len(alike[j]), default=None)
         if best is None or 2 * len(alike[best]) <= len(heard) or len(alike[best]) < 2:
             return
         x, e = b.at("x", self.ego), b.at("b", best)

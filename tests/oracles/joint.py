@@ -107,5 +107,4 @@ def whitened(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[Fl
     residual = relative - np.array(spherical(*gap))
     residual[1:] = wrap(residual[1:])
     there, std = np.isfinite(relative), noise_model.sensors.relative_std
-    jacobian = slopes(gap, noise_model.sensors.min_range)
-    return (jacobian / std[:, None])[there], (residual / std)[there]
+    return (slopes(gap, noise_model.sensors.min_range) / std[:, None])[there], (residual / std)[there]

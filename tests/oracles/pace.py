@@ -13,8 +13,7 @@ from coopoc.world.recording import Recording
 def after(square: Floats, u: Floats, seconds: float) -> Floats:
     """(..., 3) m^2/s^2: a first-order lag of 0.5 s, of a velocity at most twice the pace and 10 m/s^2 beyond."""
     most = 4 * square.sum(axis=-1, keepdims=True) + (10 * seconds) ** 2
-    size = (u**2).sum(axis=-1, keepdims=True)
-    own: Floats = u**2 * np.fmin(1.0, most / np.fmax(size, 1e-300))
+    own: Floats = u**2 * np.fmin(1.0, most / np.fmax((u**2).sum(axis=-1, keepdims=True), 1e-300))
     return square + seconds / (seconds + 0.5) * (own - square)
 
 

@@ -31,8 +31,7 @@ def nearest(position: Array, ego: int, most: int) -> list[int]:
     """Columns of the vehicles within 30 m, and further than 2 m, nearest first."""
     gap = np.sqrt(((position - position[ego]) ** 2).sum(-1))
     gap[ego] = inf
-    order = [j for j in np.argsort(gap) if gap[j] <= 30.0]
-    return order[:most]
+    return [j for j in np.argsort(gap) if gap[j] <= 30.0][:most]
 
 
 def step(
@@ -84,8 +83,7 @@ def laplacian(x: Array, p: Array, fixes: Array, relative: list[Array], new: list
         delta[0], delta[k] = delta[0] - v, delta[k] + v
     h = np.kron(np.vstack([lap, np.eye(n)]), np.eye(3))
     p = inv(inv(p) + h.T @ h)
-    z = np.vstack([delta, fixes]).ravel()
-    return (x.ravel() + p @ h.T @ (z - h @ x.ravel())).reshape(-1, 3), p
+    return (x.ravel() + p @ h.T @ (np.vstack([delta, fixes]).ravel() - h @ x.ravel())).reshape(-1, 3), p
 
 
 def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.random.Generator) -> Array:

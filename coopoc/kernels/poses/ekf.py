@@ -7,7 +7,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
-from ..odometry_fault import SIZE, judge
+from ..odometry_fault import judge
 from .odometry import join, predict, symmetrise
 from .scalar_update import (
     ALONE,
@@ -117,9 +117,7 @@ def step(
             predict(poses, faults[k], member, d, own[4:7], own[7], measured.dt, noise)
         elif active[k]:
             join(poses, member, d, own, noise)
-            for pace in range(faults.shape[1]):
-                for i in range(SIZE):
-                    faults[k, pace, i] = faults[-1, pace, i]
+            faults[k] = faults[-1]
             again = 0
             for s in range(t):
                 again += measured.active[s + 1, k] and not measured.active[s, k]

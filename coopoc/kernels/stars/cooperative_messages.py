@@ -426,16 +426,16 @@ def trust(f: Filter, model: Model) -> None:
 def doubt_ego(f: Filter, model: Model) -> None:
     """Where the fixes of most neighbours err by one and the same vector beyond doubt, and none has ever been trusted,
     it is the ego's receiver that errs: the ego goes where they see it, and they join anew."""
-    who = f.who
+    who, members = f.who, range(1, len(f.who))
     g, ego, best, most, others = f.g, who[0, VEHICLE], ABSENT, 1, heard(f, False)
     if others < 2 or f.status[ego, TRUSTED] == 0.0:
         return
     for j in range(len(f.slot)):
         if j != ego and (f.status[j, TRUSTED] > 0.0 or f.status[j, REVOKED] > 0.0):
             return
-    for k in range(1, len(who)):
+    for k in members:
         alike = 0
-        for i in range(1, len(who)):
+        for i in members:
             alike += difference(f, k, k) > WILD and (i == k or difference(f, k, i) < FIX_GATE)
         if alike > most:
             best, most = k, alike
@@ -445,9 +445,9 @@ def doubt_ego(f: Filter, model: Model) -> None:
     for c in range(3):
         spread += (g.p[c, c] + g.p[first + c, first + c] + 2.0 * g.p[c, first + c]) / 3.0
     there = add(vector_at(g.x, 0), vector_at(g.x, first // 3))
-    for k in range(1, len(who)):
+    for k in members:
         who[k, HITS] = k == best or difference(f, best, k) < FIX_GATE
-    for k in range(1, len(who)):
+    for k in members:
         j, agrees = who[k, VEHICLE], who[k, HITS] > 0
         if j >= 0:
             dismiss(f, model, k, False)

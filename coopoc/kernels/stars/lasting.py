@@ -10,6 +10,9 @@ In a star the errors of the others show how far a sound receiver errs: at least 
 that distance. A minority of spoofed receivers, alike or not, and a wrong position of the ego, which all
 these errors have in common, hardly change it.
 
+Where at most one receiver of the star is trusted, the ego's included, nothing tells which one errs: if it is that one,
+the answer errs by what the others seem to err by, e. So its covariance increases by half the sum of e e^T.
+
 References:
     Mehra, On the identification of variances and adaptive Kalman filtering, IEEE TAC 15(2), 1970 (correlated
     innovations); James, Stein, Estimation with quadratic loss, 1961 (c - s^2 / c).
@@ -113,8 +116,9 @@ def remember_error(f: Filter, own: Floats) -> None:
 @part
 def add_lasting(f: Filter, model: Model, own: Floats) -> None:
     """Add to the answer's covariance what it is more uncertain by, as levels were otherwise, and the variance of errors
-    of fixes that last: those of the ego, where pairs within two seconds count as one, or the mean of the star's."""
-    ego = f.ego
+    of fixes that last: those of the ego, where pairs within two seconds count as one, or the mean of the star's; and
+    those of all that are not trusted, where at most one is."""
+    ego, neighbours = f.ego, heard(f, True)
     for i in range(9):
         ego[COVARIANCE + i] *= 1.0 + ego[UNSAID] / max(ego[WHOLE], 1e-300)
     n, seconds = max(ego[PAIRS], 1.0), min(max(ego[CLOCK], ERROR_MEMORY_S), PRODUCT_MEMORY_S)
@@ -123,6 +127,13 @@ def add_lasting(f: Filter, model: Model, own: Floats) -> None:
         return
     stated = ego[COVARIANCE] + ego[COVARIANCE + 4] + ego[COVARIANCE + 8]
     shown = c - error / c - stated if c > 0.0 and c * c > error else 0.0
-    more = max(shown, 3.0 * usual_error(f, ABSENT) / (1.0 + heard(f, True))) / sum(vector_at(own, FIX_VARIANCE // 3))
+    more = max(shown, 3.0 * usual_error(f, ABSENT) / (1.0 + neighbours)) / sum(vector_at(own, FIX_VARIANCE // 3))
     for i in range(3):
         ego[COVARIANCE + 4 * i] += more * own[FIX_VARIANCE + i]
+    trusted = neighbours + f.status[f.who[0, VEHICLE], TRUSTED]
+    for k in range(len(f.who) if trusted < 2.0 else 0):
+        j = f.who[k, VEHICLE]
+        if j >= 0 and f.status[j, TRUSTED] == 0.0:
+            e = 3 * f.g.block[k, ERROR]
+            for i in range(9):
+                ego[COVARIANCE + i] += 0.5 * f.g.x[e + i // 3] * f.g.x[e + i % 3]
