@@ -155,14 +155,12 @@ def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:
     along = travelled - np.cumsum(rng.uniform(*gap, count))
     across = 3.5 * rng.integers(0, 2, count) + 0.3 * np.sin(along / 40.0 + rng.uniform(0, 6, count))
     incline = rng.uniform(-0.04, 0.04)
-    road = np.stack([along, across, incline * along], axis=-1)
-    return turned(road, np.array(rng.uniform(-pi, pi)))
+    return turned(np.stack([along, across, incline * along], axis=-1), np.array(rng.uniform(-pi, pi)))
 
 
 def _platoon(rng: Draws, t: Floats, _: Split) -> Floats:
     count, speed, period = int(rng.integers(4, 11)), rng.uniform(6.0, 30.0), rng.uniform(15.0, 40.0)
-    phase = 2 * pi * (t[:, None] / period + 0.03 * np.arange(count))
-    wave = 0.2 * speed * period / (2 * pi) * np.sin(phase)
+    wave = 0.2 * speed * period / (2 * pi) * np.sin(2 * pi * (t[:, None] / period + 0.03 * np.arange(count)))
     return _column(rng, speed * t[:, None] + wave, (8.0, 25.0))
 
 

@@ -190,5 +190,4 @@ def located(recording: Recording) -> Bools:
     """
     present = recording.present
     joined = last_true(present & ~np.concatenate([np.zeros_like(present[:1]), present[:-1]]))
-    fix = last_true(np.isfinite(recording.gnss).all(axis=-1), axis=1)
-    return present & (fix >= joined)
+    return present & (last_true(np.isfinite(recording.gnss).all(axis=-1), axis=1) >= joined)

@@ -238,8 +238,7 @@ def odometry(c: Check, column: int) -> Estimate:
         if abs(value[2]) > max(5.0 * BEHIND, SURE_ERRORS * error[2]):  # smoothed fixes cut bends: all else seems wrong
             error[[0, 1, 3, 4]] = inf
         return Estimate(value, error)
-    path = plane(truth.position[:, column])
-    true = np.diff(path, prepend=nan) / rec.dt  # as odometry, the mean over a step
+    true = np.diff(plane(truth.position[:, column]), prepend=nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]
     if body is not None:
         odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
@@ -386,8 +385,7 @@ def _beside(off: AnyArray, velocity: AnyArray) -> float:
     """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none. At
     one velocity a lag is no explanation."""
     finite = np.isfinite(off + velocity)
-    x = np.column_stack([np.ones(finite.sum()), velocity[finite]])
-    beside = abs(lstsq(x, off[finite])[0][0])
+    beside = abs(lstsq(np.column_stack([np.ones(finite.sum()), velocity[finite]]), off[finite])[0][0])
     return float(min(beside, abs(off[finite].mean())) if finite.any() else 0.0)
 
 

@@ -451,7 +451,6 @@ def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, s
     ):
         summary.refuse(why, rows[rows["t"].isin(fixes.t[left])].drop_duplicates("t"))
     after = np.minimum(step + 1, len(gnss) - 1)
-    during = np.where((lag > 0) & there[after], after, step)
-    gnss[step] = fixes.value[kept] - lag[:, None] * velocity[during]
+    gnss[step] = fixes.value[kept] - lag[:, None] * velocity[np.where((lag > 0) & there[after], after, step)]
     summary.count("fixes", len(kept))
     return gnss
