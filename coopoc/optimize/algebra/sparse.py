@@ -15,7 +15,7 @@ from ..model.derivatives import Kind, Model, Structure, Term, numbers_of, write
 from ..model.factor import steerable
 from ..model.problem import Problem
 from ..model.space import Space
-from .cholesky import Cholesky
+from .cholesky import Cholesky, cholesky_of
 
 LIBRARIES = ("scipy.sparse", "coopoc.kernels.graphs.graph_tape", "coopoc.kernels.graphs.multifrontal")
 """What every solve imports late, so that `import coopoc` stays quick."""
@@ -227,12 +227,21 @@ class Sparse:
         total = self.layout.total(model, x, self.numbers)
         return float(total[0]), total[1 : m + 1], total[m + 1 : -1]
 
+    def settled(self, x: Floats, dof: int) -> Floats:
+        """x (n, ambient) after a Gauss-Newton step along the first directions of each node, or as it is where that has
+        none."""
+        from scipy.sparse import csc_array
+
+        _, gradient, values = self.quadratic(x, "gauss-newton")
+        entries, step = self.entries, np.zeros(self.size)
+        own, upper = np.nonzero(entries.number >= 0)[1] < dof, csc_array((values, entries.indices, entries.indptr))
+        if factored := cholesky_of(upper[own][:, own]):
+            step[own] = -factored.solve(gradient[own])
+        return self.retract(x, step)
+
     def retract(self, x: Floats, step: Floats) -> Floats:
         """x after a step (m,)."""
-        number = self.entries.number
-        if len(step) == number.size:
-            return self.space.retract(x, step.reshape(number.shape))
-        return self.space.retract(x, np.append(step, 0.0)[number])
+        return self.space.retract(x, np.append(step, 0.0)[self.entries.number])
 
 
 def sparse(problem: Problem) -> Sparse:

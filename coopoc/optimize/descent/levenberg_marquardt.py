@@ -45,6 +45,9 @@ NEXT_STEP, NEXT_TOLERANCES = 1e-7, 10.0
 """
 HIDDEN_STEPS = 12
 """In a row, that end the loop: damping has fallen from FIRST_DAMPING to none, or the matrix is singular without."""
+SLOW, SADDLE = 1e-2, 1e-4
+"""Predicted decrease, as a share of the cost, up to which positions are solved anew where a step gains little, and that
+of the last step up to which an exact Hessian that is not positive definite is damped: J^T J leads to the saddle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,8 @@ def arrive(
     multiplier of a trust region |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4.
     Where the steps are `bounded`, the last one is below the tolerance. A `smooth` descent ends with the first step
     whose gain ratio is not within 1/2 .. 3/2. An undamped step that raises the cost is taken with the next one where
-    both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines.
+    both lower it by what the first promised: far ends of a long drive turn too far to be moved by straight lines. Where
+    only coordinates are measured, the positions of a step that gains little are solved anew for its rotations.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3;
@@ -91,62 +95,62 @@ def arrive(
     """
     mu, against, cholesky = 0.0, 0, system.cholesky
 
-    def factored(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
-        return (-cholesky.solve(gradient), 0.0) if cholesky.factor(values) else None
-
-    step = step or factored
+    step = step or (lambda _, values, gradient: (-cholesky.solve(gradient), 0.0) if cholesky.factor(values) else None)
     model: Model = "gauss-newton"
-    record: list[tuple[float, float, float]] = []
-    converged, still, before, next_step = False, 0, 0.0, min(NEXT_STEP, NEXT_TOLERANCES * tolerance)
-    cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
+    flat = {"distance", "angle"}.isdisjoint(c for t in system.layout.terms for c in t.kind.measurement.components)
+    record, most = list[tuple[float, float, float]](), FIRST_DAMPING if smooth else 1e12
+    hold = LEAST_INFORMATION if bounded else 1.0  # what nothing measures stays where it is
+    next_step = min(NEXT_STEP, NEXT_TOLERANCES * tolerance)
+    converged, still, before, predicted, steered = False, 0, 0.0, np.inf, smooth or bounded
+    cost, gradient, values = system.quadratic(x, model)
     with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
-        while len(record) < max_iterations and not converged and mu < 1e12:  # no step can help
+        while len(record) < max_iterations and not converged and mu < most:  # beyond it no step can help
             counted(cost)
-            damping = _marquardt(system, undamped[2], mu, LEAST_INFORMATION if bounded else 1.0)
-            whole = values
-            if damping is not None:
-                whole = values.astype(float)
-                whole[system.entries.diagonal] += damping
+            if model == "gauss-newton":
+                scale = values[system.entries.diagonal]
+            damping = mu * np.maximum(scale, LEAST_INFORMATION) + (scale == 0.0) * hold
+            whole = values.copy()
+            whole[system.entries.diagonal] += damping
             taken = step(x, whole, gradient)
             if taken is None:
                 record.append((cost, mu, np.nan))
-                if model == "newton" and not still:
+                if model == "newton" and predicted > SADDLE * cost:
                     against, model = -HESSIAN_AFTER_STEPS, "gauss-newton"
-                    cost, gradient, values = undamped = system.quadratic(x, model)
+                    cost, gradient, values = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
-                    if smooth:
-                        break
                 continue
             dx, push = taken
-            predicted = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx + push)
+            predicted = 0.5 * float(damping @ (dx * dx) - gradient @ dx + push)
             there = system.retract(x, dx)
             near = predicted <= HESSIAN_SHARE * cost and against >= 0
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
+            if flat and not steered and predicted <= SLOW * cost and not cost - trial[0] > 0.75 * predicted:
+                moved = system.settled(there, system.space.dimension)
+                if (better := system.quadratic(moved, used))[0] < trial[0]:
+                    there, trial = moved, better
             after = trial[0]
             length = float(abs(dx).max(initial=0.0))
-            small, swift = length <= tolerance, model == "newton" and not mu and not bounded
+            small = length <= tolerance
             hidden = predicted <= HIDDEN * cost and (after <= cost * (1.0 + 1e-13) or (small and bounded))
             gain = 1.0 if hidden else (cost - after) / abs(predicted)
             still = still + 1 if hidden else 0
             record.append((cost, mu, gain))
+            swift = model == "newton" and not mu and abs(gain - 1.0) < MISMATCH and length**2 <= next_step * before
             converged = (hidden and small) or (
-                not bounded and (predicted <= ROUNDED_SHARE * max(cost, 1.0) or still > HIDDEN_STEPS)
+                not bounded and (swift or predicted <= ROUNDED_SHARE * max(cost, 1.0) or still > HIDDEN_STEPS)
             )
-            converged |= swift and abs(gain - 1.0) < MISMATCH and length * length <= next_step * before
             before = length
             if not gain > 0.0:
-                corrected = None if mu or smooth or bounded or model == "newton" else _corrected(system, there)
-                kept = -np.inf if corrected is None else (cost - system.cost(corrected)) / predicted
-                if corrected is not None and kept > 1.0 - MISMATCH:
-                    record.append((after, mu, kept))
-                    x = corrected
-                    cost, gradient, values = undamped = system.quadratic(x, model)
-                    continue
+                if not (mu or steered or model == "newton"):
+                    there = system.settled(there, system.space.dof)
+                    trial = system.quadratic(there, model)
+                    if (kept := (cost - trial[0]) / predicted) > 1.0 - MISMATCH:
+                        record.append((after, mu, kept))
+                        x, (cost, gradient, values) = there, trial
+                        continue
                 mu = _grown(mu)
-                if smooth:
-                    break
                 continue
             x = there
             mu = _next(mu, gain)
@@ -159,14 +163,7 @@ def arrive(
                 model = "newton" if against >= HESSIAN_AFTER_STEPS else model
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
-                undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3))
-
-
-def _corrected(system: Sparse, x: Floats) -> Floats | None:
-    """x after a Gauss-Newton step."""
-    _, gradient, values = system.quadratic(x, "gauss-newton")
-    return system.retract(x, -system.cholesky.solve(gradient)) if system.cholesky.factor(values) else None
 
 
 def _grown(mu: float) -> float:
@@ -177,16 +174,6 @@ def _next(mu: float, gain: float) -> float:
     if gain > 0.75:
         return mu / DECAY if mu > LEAST_DAMPING else 0.0
     return _grown(mu) if gain < 0.25 else mu
-
-
-def _marquardt(system: Sparse, values: Floats, mu: float, hold: float) -> Floats | None:
-    """(m,) mu times the diagonal of J^T J of `values`, and `hold` where that is zero, as what nothing measures stays
-    where it is. None where all is zero."""
-    diagonal = values[system.entries.diagonal]
-    unmeasured = diagonal == 0.0
-    if not mu and not unmeasured.any():
-        return None
-    return np.asarray(mu * np.maximum(diagonal, LEAST_INFORMATION) + hold * unmeasured)
 
 
 DELAY = 2.0

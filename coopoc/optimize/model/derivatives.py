@@ -99,11 +99,7 @@ def numbers_of(factor: Factor) -> Floats:
     """(P, M) z, constants and weights of the measurements of a factor."""
     weight = np.asarray(factor.sqrt_information) if factor.std is None else 1.0 / factor.std
     parts = factor.z, np.asarray(factor.constants), weight.reshape(len(weight), -1)
-    numbers, end = np.empty((sum(part.shape[1] for part in parts), len(factor.nodes))), 0
-    for part in parts:
-        begin, end = end, end + part.shape[1]
-        numbers[begin:end] = part.T
-    return numbers
+    return np.hstack([np.broadcast_to(part, (len(factor.nodes), part.shape[1])) for part in parts]).T.copy()
 
 
 def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:

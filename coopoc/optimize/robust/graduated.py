@@ -244,11 +244,11 @@ def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
     of the ranges put them."""
     rng = np.random.default_rng(0)
     for k, y in enumerate(scattered(problem, x, loose)):
-        part = (
+        part = tuple(
             taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PATH_SHARE)) if f.kind == "range" else f
             for f in problem.factors
         )
-        paths = x if k % 2 or problem.poses else scaled(problem.replace_unchecked(factors=tuple(part)), x)
+        paths = x if k % 2 or problem.poses else scaled(problem.replace_unchecked(factors=part), x)
         yield y if paths is x else paths
 
 

@@ -148,7 +148,7 @@ def tree(graph: Graph) -> Floats:
         turns, _ = averaging(edges.nodes, variance, len(rotation), held)
         rotation = exp(turns(log(rotation[j] @ (rotation[i] @ edges.rotation).mT))) @ rotation
     space, kinds = Space(d, has_rotation=True), (edges, graph.relative_point)
-    at = space.position(with_points(graph, position, rotation, reached))
+    at = with_points(graph, position, rotation, reached)[:, :d]
     (i, j), moved = np.concatenate([each.nodes for each in kinds]).T, np.concatenate([each.position for each in kinds])
     variance = np.concatenate([position_variance(each, d) for each in kinds])
     places, _ = averaging(np.column_stack([i, j]), variance, len(at), held)

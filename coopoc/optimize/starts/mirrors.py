@@ -204,16 +204,16 @@ def _elsewhere(ranges: Ranges, body: Ints, ends: Ints, most: float) -> list[Move
     spheres cross: where what ranges it has yet to give way, these need not be the image."""
     space, x, rows = ranges.problem.space, ranges.x, ends // 2
     own, other = ranges.nodes[rows, ends % 2], ranges.nodes[rows, 1 - ends % 2]
-    if len(rows) < 2 and not (len(rows) and space.dimension == 3):
+    if len(rows) < 4 - space.dimension:
         return []
     at, places, index = space.position(x[body]), space.position(x[other]), np.searchsorted(body, own)
-    least = ELSEWHERE_SHARE * ranges.distance[rows].mean()
+    distance = ranges.distance[rows]
+    least = ELSEWHERE_SHARE * distance.mean()
 
     def costs(at: Floats) -> Floats:
         """(C,) of places (C, K, d) of the body."""
         return ranges.cost(norm(at[:, index] - places, axis=2).T, rows)
 
-    distance = ranges.distance[rows]
     image = mirrored(at, places)
     met, turn = image[None], nearest_rotation(np.eye(space.dimension)[None])
     if len(body) > 1:

@@ -118,8 +118,10 @@ def race(
     mean, variance = expected(problem, system.size)
     usual = EXCESS_STDS * np.sqrt(variance)
     limit = mean + usual
-    relative = all(f.measurement.compares_poses for f in problem.factors)
-    relative = relative and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
+    relative = (
+        all(f.measurement.compares_poses for f in problem.factors)
+        and sum(len(f.nodes) for f in problem.factors if f.nodes.shape[1] == 1) <= 1
+    )
     for name, start in starts.items():
         end, cost = attempt(name, directed(problem, start()), FIRST_STEPS, True), tried[name][0]
         if not smooth(end.record):
