@@ -97,11 +97,14 @@ def arrive(
 
     step = step or (lambda _, values, gradient: (-cholesky.solve(gradient), 0.0) if cholesky.factor(values) else None)
     model: Model = "gauss-newton"
-    flat = {"distance", "angle"}.isdisjoint(c for t in system.layout.terms for c in t.kind.measurement.components)
+    steered = smooth or bounded
+    flat = not steered and {"distance", "angle"}.isdisjoint(
+        c for t in system.layout.terms for c in t.kind.measurement.components
+    )
     record, most = list[tuple[float, float, float]](), FIRST_DAMPING if smooth else 1e12
     hold = LEAST_INFORMATION if bounded else 1.0  # what nothing measures stays where it is
     next_step = min(NEXT_STEP, NEXT_TOLERANCES * tolerance)
-    converged, still, before, predicted, steered = False, 0, 0.0, np.inf, smooth or bounded
+    converged, still, before, predicted = False, 0, 0.0, np.inf
     cost, gradient, values = system.quadratic(x, model)
     with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
         while len(record) < max_iterations and not converged and mu < most:  # beyond it no step can help
@@ -126,7 +129,7 @@ def arrive(
             near = predicted <= HESSIAN_SHARE * cost and against >= 0
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
-            if flat and not steered and predicted <= SLOW * cost and not cost - trial[0] > 0.75 * predicted:
+            if flat and HIDDEN * cost < predicted <= SLOW * cost and cost - trial[0] <= 0.75 * predicted:
                 moved = system.settled(there, system.space.dimension)
                 if (better := system.quadratic(moved, used))[0] < trial[0]:
                     there, trial = moved, better
