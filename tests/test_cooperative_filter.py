@@ -205,7 +205,7 @@ def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step):
 def test_a_wrong_start_is_left_soon_after_it(most, std, off):
     """Law: fixes that are wrong for the first 10 s leave the ego where it is 10 s later. Beside one neighbour it stayed
     off for good, neither receiver being trusted; alone it turned its odometry until it met the fixes. If its fixes
-    stay wrong, one neighbour does not tell which receiver errs, and the covariance has room for both."""
+    stay wrong, beside one neighbour it is unknown which receiver errs, and the covariance has room for both."""
     fleet = load_fleet("town10").between(0, 300)
     seen = observe(fleet, replace(S2, gnss_std=(std,) * 3), V2X(most, radius=100.0), runs=3, seed=7, observers=[24])
     track, always = (

@@ -87,7 +87,7 @@ def cache(tmp_path, monkeypatch):
 
 def entry(name: str, files: dict[str, bytes], address: str = "", **more: str) -> Entry:
     rows = {f: (f"{address}/{f}", len(data), hashlib.sha256(data).hexdigest()) for f, data in files.items()}
-    return Entry(name, "a car", "MIT", "Nobody, 2026", "https://example.org/page", "not tried", rows, **more)
+    return Entry(name, "a car", "MIT", "An author, 2026", "https://example.org/page", "not tried", rows, **more)
 
 
 @pytest.fixture

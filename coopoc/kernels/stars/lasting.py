@@ -10,7 +10,7 @@ In a star the errors of the others show how far a sound receiver errs: at least 
 that distance. A minority of spoofed receivers, alike or not, and a wrong position of the ego, which all
 these errors have in common, hardly change it.
 
-Where at most one receiver of the star is trusted, the ego's included, nothing tells which one errs: if it is that one,
+Where at most one receiver of the star is trusted, the ego's included, it is unknown which one errs: if it is that one,
 the answer errs by what the others seem to err by, e. So its covariance increases by half the sum of e e^T.
 
 References:

@@ -245,7 +245,7 @@ def reached_once(costs: Sequence[float], least: float) -> tuple[str, ...]:
     >>> reached_once([3.0, 2.0, 4.0], 2.0)
     ('one of 3 starts leads to this minimum: a lower one may exist',)
     """
-    once = sum(not higher(each, least, SAME_COST) for each in costs) < 2 <= len(costs)
+    once = sum(not higher(each, least) for each in costs) < 2 <= len(costs)
     return (f"one of {len(costs)} starts leads to this minimum: a lower one may exist",) * once
 
 
