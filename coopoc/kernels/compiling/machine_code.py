@@ -20,7 +20,7 @@ from numba.core.compiler import CompileResult
 from .waiting import waiting
 
 KERNELS = Path(__file__).resolve().parents[1]
-IMPORT = re.compile(r"^from (\.*[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+IMPORT = re.compile(r"^ *from (\.*[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 LOCATORS = (UserProvidedCacheLocator, InTreeCacheLocator, UserWideCacheLocator)
 
 

@@ -9,6 +9,8 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.typed_passes import NopythonRewrites
 from numba.core.types.functions import BaseFunction
 from numba.core.untyped_passes import InlineClosureLikes
+from numba.extending import models, register_model
+from numba.np import arrayobj
 
 
 class KernelLibrary(JITCodeLibrary):
@@ -61,6 +63,22 @@ class KernelFlags(Flags):  # numba looks options up for every operation that it 
     __hash__ = lambda self: hash(tuple(self._values))  # noqa: E731
     __eq__ = lambda self, other: self._values == other._values  # noqa: E731
 
+
+def _model(manager: Any, kind: Any) -> Any:
+    """A NamedTuple of ours is one argument of a call, not one for each number that describes its arrays."""
+    uniform = isinstance(kind, types.NamedUniTuple)
+    model: Any = (models.UniTupleModel if uniform else models.TupleModel)(manager, kind)
+    if kind.instance_class.__module__.startswith("coopoc."):
+        model.get_argument_type = model.get_value_type
+        model.as_argument = model.from_argument = lambda builder, value: value
+    return model
+
+
+register_model(types.NamedTuple)(_model)
+register_model(types.NamedUniTuple)(_model)
+Generic: Any = arrayobj.ol_raise_with_shape_context_generic
+# Names no shapes where those of an assignment differ: to compile the text of numbers takes seconds.
+arrayobj.ol_raise_with_shape_context_cpu.__code__ = Generic.__code__
 
 UNUSED = InlineClosureLikes, NopythonRewrites
 """Passes for what no kernel has: closures, comprehensions and sums of whole arrays."""

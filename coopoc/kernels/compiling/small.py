@@ -19,8 +19,8 @@ def order(matrix: Numbers) -> int:
     return math.isqrt(len(matrix))
 
 
-def _entries(d: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(d) for j in range(d)]
+def _entries(rows: int, columns: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(rows) for j in range(columns)]
 
 
 def _dot(first: Number, a: Numbers, b: Numbers) -> Number:
@@ -35,6 +35,10 @@ def _rounded(first: Number, a: Numbers, b: Numbers) -> Number:
     for x, y in zip(a, b, strict=True):
         first = first + x * y
     return first
+
+
+def _inner(a: Numbers, b: Numbers) -> Number:
+    return _rounded(a[0] * b[0], a[1:], b[1:])
 
 
 @unrolled
@@ -73,10 +77,14 @@ def times(a: Any, b: Any) -> Any:
     return [x * y for x, y in zip(a, b, strict=True)]
 
 
+inner_product: Any = unrolled(_inner)
+"""The sum of a_i b_i, every product and sum rounded by itself."""
+
+
 @unrolled
-def inner_product(a: Any, b: Any) -> Any:
-    """The sum of a_i b_i, every product and sum rounded by itself."""
-    return _rounded(a[0] * b[0], a[1:], b[1:])
+def over(a: Any) -> Any:
+    """1 / a_i."""
+    return [x.over() for x in a]
 
 
 @unrolled
@@ -101,14 +109,7 @@ def choose_each(sign: Any, a: Any, b: Any) -> Any:
 def transpose(a: Any) -> Any:
     """A^T."""
     d = order(a)
-    return [a[j * d + i] for i, j in _entries(d)]
-
-
-@unrolled
-def mirrored(a: Any) -> Any:
-    """The symmetric matrix of which only the upper triangle of A counts."""
-    d = order(a)
-    return [a[min(i, j) * d + max(i, j)] for i, j in _entries(d)]
+    return [a[j * d + i] for i, j in _entries(d, d)]
 
 
 @unrolled
@@ -118,31 +119,30 @@ def from_upper(u: Any) -> Any:
 
 
 @unrolled
+def diagonal(v: Any) -> Any:
+    """diag(v)."""
+    return [v[i] * float(i == j) for i, j in _entries(len(v), len(v))]
+
+
+@unrolled
 def add_diagonal(a: Any, v: Any) -> Any:
     """A + diag(v)."""
     d = len(v)
-    return [a[i * d + j] + v[i] if i == j else a[i * d + j] for i, j in _entries(d)]
+    return [a[i * d + j] + v[i] if i == j else a[i * d + j] for i, j in _entries(d, d)]
 
 
 @unrolled
 def minus_product(a: Any, b: Any) -> Any:
-    """-A B."""
-    d = order(a)
-    return [_dot(-(a[i * d] * b[j]), a[i * d + 1 : i * d + d], b[d + j :: d]) for i, j in _entries(d)]
+    """-A B, B a matrix or a vector."""
+    d, m = order(a), len(b) // order(a)
+    return [_dot(-(a[i * d] * b[j]), a[i * d + 1 : i * d + d], b[m + j :: m]) for i, j in _entries(d, m)]
 
 
 @unrolled
 def less_transposed_product(t: Any, a: Any, b: Any) -> Any:
-    """T - A^T B."""
-    d = order(t)
-    return [_dot(t[i * d + j], a[i::d], b[j::d]) for i, j in _entries(d)]
-
-
-@unrolled
-def minus_apply(a: Any, v: Any) -> Any:
-    """-A v."""
-    d = len(v)
-    return [_dot(-(a[i * d] * v[0]), a[i * d + 1 : i * d + d], v[1:]) for i in range(d)]
+    """T - A^T B, B a matrix or a vector."""
+    d, m = order(a), len(b) // order(a)
+    return [_dot(t[i * m + j], a[i::d], b[j::m]) for i, j in _entries(d, m)]
 
 
 @unrolled
@@ -153,16 +153,10 @@ def less_applied(t: Any, a: Any, v: Any) -> Any:
 
 
 @unrolled
-def less_transposed_applied(t: Any, a: Any, v: Any) -> Any:
-    """t - A^T v."""
-    return [_dot(t[i], a[i :: len(v)], v) for i in range(len(v))]
-
-
-@unrolled
 def apply(a: Any, v: Any) -> Any:
     """A v, every product and sum rounded by itself."""
     d = len(v)
-    return [_rounded(a[i * d] * v[0], a[i * d + 1 : i * d + d], v[1:]) for i in range(d)]
+    return [_inner(a[i * d : i * d + d], v) for i in range(d)]
 
 
 @unrolled

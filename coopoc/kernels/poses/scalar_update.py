@@ -14,7 +14,7 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import Floats
-from ..compiling.compile import part
+from ..compiling.compile import inside, part
 from ..compiling.vectors import LANES, less, plus, put, take
 from ..gate import FIX_GATE, GATE, count, gate_fix, inflation
 from ..geometry import Numbers, axes, direction
@@ -174,7 +174,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     return True
 
 
-@part
+@inside
 def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
     """LANES numbers of a row of `tiles` times as many."""
     return take(rows, uint64(row * tiles + tile))

@@ -90,12 +90,6 @@ def fresh(star: Star, k: int, flat: float) -> Numbers:
     return (*add_diagonal(zeros(o, BLOCK), variance), y, y, y, o)
 
 
-@inside
-def forget(star: Star, gates: Gates, k: int, where: float, flat: float) -> None:
-    """Let a member join anew where a number is above 0."""
-    store(gates.state, k, choose_each(where, fresh(star, k, flat), load(gates.state, k, STATE)))
-
-
 @inner
 def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
     """How many neighbours, measured whole, are where their messages say if the ego is at a position."""
@@ -165,12 +159,6 @@ def gate_star(star: Star, gates: Gates, state: Floats, placed: Floats, least: fl
         store(star.relative, k, inflated(polar, factor))
         total = total + gate_position(star, k, add(at, moved), add(ego[:9], cov), hits)
     store(gates.state, 0, (*ego[:12], choose(own, max(hits + total, o), max(hits + LEAK * own, o))))
-
-
-@inner
-def set_ego(gates: Gates, cov: Numbers) -> None:
-    """Remember the ego's covariance m^2."""
-    store(gates.state, 0, (*cov, *load(gates.state, 0, STATE)[9:]))
 
 
 @inside

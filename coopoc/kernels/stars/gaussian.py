@@ -16,7 +16,6 @@ from ..compiling.small import (
     inverse,
     less_applied,
     less_transposed_product,
-    minus_apply,
     minus_product,
     negate,
     plus_applied,
@@ -335,7 +334,7 @@ def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> N
             store(h.matrix, k, BLOCK)
     for k in range(h.block[TERMS]):
         store(h.matrix, k, minus_product(b, block_at(h.matrix, k)))
-    store(h.three, Z // 3, minus_apply(b, vector_at(h.three, Z // 3)))
+    store(h.three, Z // 3, minus_product(b, vector_at(h.three, Z // 3)))
     project(g, h)
     new = insert(g, member, FRESH)
     for c in range(3):

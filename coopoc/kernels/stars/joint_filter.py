@@ -19,28 +19,28 @@ from ..compiling.small import (
     add,
     add_diagonal,
     choose_each,
+    diagonal,
+    from_upper,
     inverse,
     less_applied,
-    less_transposed_applied,
     less_transposed_product,
-    minus_apply,
+    load,
     minus_product,
-    mirrored,
     negate,
+    over,
     plus_applied,
     scale,
     store,
     subtract,
     times,
     transpose,
-    zeros,
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import BACK
 from ..geometry import Numbers, converted, exact, incomplete, metres, missing, vector, whole
-from .gated import Gates, carry, forget, gate_star, gates_within, go_back, set_ego
+from .gated import STATE, Gates, carry, fresh, gate_star, gates_within, go_back
 from .messages import (
-    BLOCK,
+    LEAST_PROCESS,
     NEW,
     NONE,
     Assumptions,
@@ -49,14 +49,14 @@ from .messages import (
     Star,
     block_at,
     clear,
-    fix_information,
     gather,
     moved_of,
     new_estimates,
     position_of,
-    process_information,
+    process_of,
     relative_of,
     star_within,
+    variance_of,
     vector_at,
 )
 
@@ -109,7 +109,7 @@ def eliminate(source: Floats, a: Floats, eta: Floats, n: int, stride: int, memor
     p: Numbers = negate(inverse(block_at(source, 0)))
     for k in range(n):
         first = k * stride
-        v = minus_apply(p, vector_at(eta, k))
+        v = minus_product(p, vector_at(eta, k))
         store(eta, k, v)
         store(a, first + k, p)
         for j in range(k + 1, n):
@@ -121,7 +121,7 @@ def eliminate(source: Floats, a: Floats, eta: Floats, n: int, stride: int, memor
             for j in range(i, n):
                 at = i * stride + j
                 store(a, at, less_transposed_product(block_at(source, at), left, block_at(a, first + j)))
-            store(eta, i, less_transposed_applied(vector_at(eta, i), left, v))
+            store(eta, i, less_transposed_product(vector_at(eta, i), left, v))
             if i == k + 1:
                 p = negate(inverse(block_at(a, i * stride + i)))
         source = a
@@ -152,11 +152,10 @@ def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats) -> 
 @inner
 def predict_block(a: Floats, k: int, n: int, stride: int, process: Numbers, memory: Floats) -> None:
     """`predict` of one block."""
-    for i in range(k):
-        store(memory, n + i, transpose(block_at(a, i * stride + k)))
-    for j in range(k + 1, n):
-        store(memory, n + j, block_at(a, k * stride + j))
-    own = mirrored(block_at(a, k * stride + k))
+    for j in range(n):
+        store(memory, n + j, block(a, k, j, stride))
+    own = block_at(memory, n + k)
+    own = from_upper((*own[:3], *own[4:6], own[8]))
     store(memory, n + k, own)
     pivot = negate(inverse(add_diagonal(own, process)))
     for j in range(n):
@@ -166,6 +165,12 @@ def predict_block(a: Floats, k: int, n: int, stride: int, process: Numbers, memo
         for j in range(i, n):
             at = i * stride + j
             store(a, at, less_transposed_product(block_at(a, at), left, block_at(memory, j)))
+
+
+@inside
+def block(a: Floats, i: int, j: int, stride: int) -> Lanes:
+    """A block, also one below the diagonal."""
+    return block_at(a, i * stride + j) if i <= j else transpose(block_at(a, j * stride + i))
 
 
 @inside
@@ -188,7 +193,7 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
         previous = star.previous[k]
         if previous >= 0:
             store(joint.state, k, add(vector_at(joint.move, previous), moved_of(star, k)))
-            store(joint.process, block_of(previous, old), process_information(star, k))
+            store(joint.process, block_of(previous, old), over(add(process_of(star, k), LEAST_PROCESS)))
         elif k == 0:
             store(joint.state, k, position_of(star, k))
         else:
@@ -227,31 +232,31 @@ def placed(joint: Joint, k: int, measured: Numbers) -> Lanes:
     return max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
 
 
+@inside
+def unknown(like: float, i: int, j: int, flat: float) -> Lanes:
+    """Information about members of which nothing is known: 1 / flat m^-2 in the blocks on the diagonal, else 0."""
+    f = 0.0 * like + (1.0 / flat if i == j else 0.0)
+    return diagonal((f, f, f))
+
+
 @inner
-def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers) -> None:
-    """Information in the order of the new star; that of a member that joins is diagonal, the tuple `prior`."""
+def rearrange(star: Star, joint: Joint, n: int, old: int, flat: float) -> None:
+    """Information in the order of the new star; of a member that joins nothing is known."""
     moved = int(n != old)
     for k in range(n):
         moved += star.previous[k] != k
     if moved == 0:
         return
     stride = joint.stride
-    o = 0.0 * vector_at(joint.information, 0)[0]
     for k in range(n):
         for j in range(n):
             i, c = block_of(k, n), block_of(j, n)
-            if c < i:
-                continue
             p, q = star.previous[k], star.previous[j]
-            if p < 0 or q < 0:
-                nothing = zeros(o, BLOCK)
-                store(joint.factor, i * stride + c, add_diagonal(nothing, prior) if k == j else nothing)
-                continue
-            p, q = block_of(p, old), block_of(q, old)
-            if p <= q:
-                store(joint.factor, i * stride + c, block_at(joint.information, p * stride + q))
-            else:
-                store(joint.factor, i * stride + c, transpose(block_at(joint.information, q * stride + p)))
+            if i <= c:
+                own = unknown(vector_at(joint.information, 0)[0], k, j, flat)
+                if p >= 0 and q >= 0:
+                    own = block(joint.information, block_of(p, old), block_of(q, old), stride)
+                store(joint.factor, i * stride + c, own)
     copy(joint.factor, joint.information, n, stride)
 
 
@@ -275,21 +280,6 @@ def add_relative(a: Floats, eta: Floats, stride: int, k: int, n: int, weight: Nu
     store(a, at, add(block_at(a, at), negate(weight)))
     store(eta, i, add(vector_at(eta, i), vector))
     store(eta, e, subtract(vector_at(eta, e), vector))
-
-
-@inside
-def solve(a: Floats, joint: Joint, eta: Floats, n: int) -> Numbers:
-    """Step A^-1 eta of the state in place of eta; minus the covariance of the ego."""
-    cov = eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch)
-    substitute(joint.factor, eta, n, joint.stride)
-    return cov
-
-
-@inside
-def move(joint: Joint, n: int) -> None:
-    """Add the step in `eta` to the state."""
-    for k in range(n):
-        store(joint.state, k, add(vector_at(joint.state, k), vector_at(joint.eta, block_of(k, n))))
 
 
 @as_written
@@ -346,10 +336,9 @@ def step(
     old: int,
 ) -> None:
     """Predict and update the state of n members, `old` of them before; the ego's covariance is then in `scratch`."""
-    flat = 1.0 / model.flat
     predict_state(star, joint, n, old)
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
-    rearrange(star, joint, n, old, (flat, flat, flat))
+    rearrange(star, joint, n, old, model.flat)
     if robust:
         carry(star, gates, model.flat, n, old)
         back = go_back(star, gates, joint.state, n)
@@ -364,13 +353,8 @@ def step(
         gate_star(star, gates, joint.state, joint.move, model.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
-    if laplacian:
-        add_laplacian(star, joint, model, n)
-        store(joint.scratch, 0, negate(solve(joint.information, joint, joint.eta, n)))
-        move(joint, n)
-    else:
-        update(star, joint, model, refine, n)
-    set_ego(gates, block_at(joint.scratch, 0))
+    update(star, joint, model, refine, laplacian, n)
+    store(gates.state, 0, (*block_at(joint.scratch, 0), *load(gates.state, 0, STATE)[9:]))
 
 
 @inner
@@ -385,30 +369,28 @@ def place_ego(joint: Joint, where: float, cov: Numbers, n: int) -> None:
 @inner
 def begin_anew(star: Star, joint: Joint, gates: Gates, where: float, flat: float, n: int) -> None:
     """Forget all, where a number is above 0: the ego starts at its fix, and its neighbours join."""
-    o = 0.0 * where
-    f = o + 1.0 / flat
     for i in range(n):
         at = position_of(star, 0) if i == 0 else first_place(star, i, vector_at(joint.state, 0))
         store(joint.state, i, choose_each(where, at, vector_at(joint.state, i)))
-        forget(star, gates, i, where, flat)
+        store(gates.state, i, choose_each(where, fresh(star, i, flat), load(gates.state, i, STATE)))
         for j in range(i, n):
-            unknown, block = zeros(o, BLOCK), i * joint.stride + j
-            unknown = add_diagonal(unknown, (f, f, f)) if i == j else unknown
-            store(joint.information, block, choose_each(where, unknown, block_at(joint.information, block)))
+            k = i * joint.stride + j
+            anew = choose_each(where, unknown(where, i, j, flat), block_at(joint.information, k))
+            store(joint.information, k, anew)
 
 
 @inner
 def add_fixes(star: Star, joint: Joint, n: int) -> None:
     """Add every member's position as broadcast."""
     for k in range(n):
-        weight, i = fix_information(star, k), block_of(k, n)
+        weight, i = scale(over(variance_of(star, k)), take(star.status, 5 * k + NEW)), block_of(k, n)
         gap, at = subtract(position_of(star, k), vector_at(joint.state, k)), i * joint.stride + i
         store(joint.information, at, add_diagonal(block_at(joint.information, at), weight))
         store(joint.eta, i, add(vector_at(joint.eta, i), times(weight, gap)))
 
 
 @inner
-def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -> None:
+def update(star: Star, joint: Joint, model: Assumptions, refine: bool, laplacian: bool, n: int) -> None:
     """Add the relative measurements, converted at the predicted geometry, and solve; to refine, solve a copy and add
     them once more, exact, linear at that solution."""
     last = 1 if refine and n > 1 else 0
@@ -420,7 +402,9 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
             copy(joint.information, a, n, joint.stride)
             for i in range(n):
                 store(eta, i, vector_at(joint.eta, i))
-        for k in range(1, n):
+        if laplacian:
+            add_laplacian(star, joint, model, n)
+        for k in range(1, 1 if laplacian else n):
             polar = relative_of(star, k)
             gap = subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
             ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
@@ -433,44 +417,41 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
                 weight, vector = scale(weight, is_placed), scale(vector, is_placed)
             vector = plus_applied(vector, weight, ahead) if stage == 1 else vector
             add_relative(a, eta, joint.stride, k, n, weight, vector)
-        store(joint.scratch, 0, negate(solve(a, joint, eta, n)))
-    move(joint, n)
+        store(joint.scratch, 0, negate(eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch)))
+        substitute(joint.factor, eta, n, joint.stride)
+    for k in range(n):
+        store(joint.state, k, add(vector_at(joint.state, k), vector_at(joint.eta, block_of(k, n))))
 
 
 @inner
 def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
     """Add L W L and L W (delta - L x), L the Laplacian of the star of complete measurements: W is 1, or the edges'
     information over the degree; that of an edge is the inverse mean variance per axis of the converted vectors."""
-    o, std, stride, e = 0.0 * vector_at(joint.state, 0)[0], model.relative_std, joint.stride, n - 1
+    o, std, stride = 0.0 * vector_at(joint.state, 0)[0], model.relative_std, joint.stride
     count, total, gaps = o, o, (o, o, o)
     for k in range(1, n):
-        edge, gap = edge_to(star, joint, k)
-        count, gaps = count + edge, add(gaps, gap)
+        polar = relative_of(star, k)
+        edge = whole(polar)
+        gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
+        store(joint.move, k, scale(gap, edge))
+        store(joint.process, k, (edge,))
+        count, gaps = count + edge, add(gaps, vector_at(joint.move, k))
         if len(std):
-            a, b, c = metres(relative_of(star, k), std, model.min_range)
+            a, b, c = metres(polar, std, model.min_range)
             total = total + edge * (a * a + b * b + c * c)
+    store(joint.process, 0, (-count,))
     outer = central = o + 1.0
     if len(std):
         outer = choose(count, 3.0 * count / max(total, o + 1e-300), outer)
         central = outer / max(count, o + 1.0)
     for k in range(1, n):
-        edge, gap = edge_to(star, joint, k)
-        weight = add_diagonal(zeros(o, BLOCK), (outer * edge, outer * edge, outer * edge))
-        add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer))
+        f = outer * take(joint.process, k)
+        add_relative(
+            joint.information, joint.eta, stride, k, n, diagonal((f, f, f)), scale(vector_at(joint.move, k), outer)
+        )
     for i in range(n):
-        row = count if i == e else -edge_to(star, joint, i + 1)[0]
-        store(joint.eta, i, subtract(vector_at(joint.eta, i), scale(gaps, row * central)))
+        row = central * take(joint.process, (i + 1) % n)
+        store(joint.eta, i, add(vector_at(joint.eta, i), scale(gaps, row)))
         for j in range(i, n):
-            other = count if j == e else -edge_to(star, joint, j + 1)[0]
-            at, number = i * stride + j, central * row * other
-            block = add_diagonal(block_at(joint.information, at), (number, number, number))
-            store(joint.information, at, block)
-
-
-@inside
-def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
-    """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
-    polar = relative_of(star, k)
-    edge = whole(polar)
-    gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
-    return edge, scale(gap, edge)
+            at, f = i * stride + j, row * take(joint.process, (j + 1) % n)
+            store(joint.information, at, add_diagonal(block_at(joint.information, at), (f, f, f)))

@@ -14,7 +14,7 @@ from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, load, scale, store
 from ..compiling.vectors import LANES, Lanes, choose, take, unrolled
-from ..geometry import Numbers, with_std
+from ..geometry import with_std
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
 """Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
@@ -29,7 +29,7 @@ ACCELERATION_STD = 1.0
 FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
 """(a, b): after `age` steps a position has gained age (a age + b) times the variance of one step. A fix that is moved
 with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
-LEAST_PROCESS = 1e-90
+LEAST_PROCESS = (1e-90,) * 3
 """m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
@@ -153,20 +153,6 @@ def variance_of(star: Star, k: int) -> Lanes:
 def relative_of(star: Star, k: int) -> Lanes:
     """What is measured of member k, the eight numbers of `Star.relative`."""
     return load(star.relative, k, RELATIVE)
-
-
-@inside
-def process_information(star: Star, k: int) -> Numbers:
-    """Inverse variance 1/m^2 of the motion of member k."""
-    p, q, r = process_of(star, k)
-    return 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
-
-
-@inside
-def fix_information(star: Star, k: int) -> Numbers:
-    """Inverse variance 1/m^2 of the position of member k, 0 where it does not count."""
-    new, (p, q, r) = take(star.status, 5 * k + NEW), variance_of(star, k)
-    return new / p, new / q, new / r
 
 
 @storage
