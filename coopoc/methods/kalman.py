@@ -14,7 +14,7 @@ from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise, own_variances
 from ..kernels.odometry_fault import new_state
-from ..kernels.solo import STATE, FixNoise, SoloMeasurements, run_filter, stream_step
+from ..kernels.solo import POSITION, STATE, FixNoise, SoloMeasurements, run_filter, stream_step
 from ..text import short_repr
 from ..world.recording import Recording, Vehicles, check_recording
 from .doubts import doubts
@@ -58,14 +58,14 @@ class FilterStream:
     def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
         self._state, self._given, self._noise = (
-            np.full((3, len(STATE)), np.nan),
+            np.full(len(STATE), np.nan),
             np.zeros(8),
             np.hstack((*motion, *fixes)),
         )
         self._odometry = new_state(motion) if fixes.gate > 0.0 else np.empty((0, 0))
         if x0 is not None:
             self._state[:] = STATE
-            self._state[:, 0] = three("x0", x0)
+            self._state[POSITION] = three("x0", x0)
 
     def step(
         self, gnss: ArrayLike | None, velocity: ArrayLike, dt: float, fix_age: float = 0.0
