@@ -4,6 +4,7 @@ One kernel runs every kind of measurement, those of plug-ins too, so that nothin
 loop over a block of measurements within each operation leaves little of the cost of reading the tape.
 """
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -11,9 +12,11 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside, part
+from ..compiling.vectors import LANES, put, take
 
 TAPE_LANES = 32
 """Measurements side by side: the rows of a tape's slots then stay in the nearest cache."""
+VECTORS = TAPE_LANES // LANES
 
 
 Operation = IntEnum(
@@ -75,7 +78,9 @@ def accumulate(tape: Tape, x: Floats, nodes: Ints, numbers: Floats, goal: Ints, 
                 for i in range(TAPE_LANES):
                     w[o, i] = tape.value[k]
             elif code <= Operation.SQRT:
-                arithmetic(code, w, o, a, b)
+                for i in range(VECTORS):
+                    p, q = take(w, a * VECTORS + i), take(w, b * VECTORS + i)
+                    put(w, o * VECTORS + i, arithmetic(code, p, q))
             elif code < Operation.FABS:
                 for i in range(TAPE_LANES):
                     w[o, i] = transcendental(code, w[a, i], w[b, i])
@@ -85,32 +90,24 @@ def accumulate(tape: Tape, x: Floats, nodes: Ints, numbers: Floats, goal: Ints, 
 
 
 @inside
-def arithmetic(code: int, w: Floats, o: int, a: int, b: int) -> None:
-    """ASSIGN to SQRT of slots a and b into slot o, a vector instruction for several lanes."""
+def arithmetic(code: int, a: float, b: float) -> float:
+    """ASSIGN to SQRT, a vector instruction for several lanes."""
+    y = a
     if code == Operation.MUL:
-        for i in range(TAPE_LANES):
-            w[o, i] = w[a, i] * w[b, i]
+        y = a * b
     elif code == Operation.ADD:
-        for i in range(TAPE_LANES):
-            w[o, i] = w[a, i] + w[b, i]
+        y = a + b
     elif code == Operation.SUB:
-        for i in range(TAPE_LANES):
-            w[o, i] = w[a, i] - w[b, i]
+        y = a - b
     elif code == Operation.DIV:
-        for i in range(TAPE_LANES):
-            w[o, i] = w[a, i] / w[b, i]
+        y = a / b
     elif code == Operation.NEG:
-        for i in range(TAPE_LANES):
-            w[o, i] = -w[a, i]
+        y = -a
     elif code == Operation.INV:
-        for i in range(TAPE_LANES):
-            w[o, i] = 1.0 / w[a, i]
+        y = 1.0 / a
     elif code == Operation.SQRT:
-        for i in range(TAPE_LANES):
-            w[o, i] = np.sqrt(w[a, i])
-    else:
-        for i in range(TAPE_LANES):
-            w[o, i] = w[a, i]
+        y = math.sqrt(a)
+    return y
 
 
 @part

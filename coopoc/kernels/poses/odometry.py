@@ -63,15 +63,25 @@ def predict(
     x[member + HEADING] += dt * (rate - bias)
     for i in range(4, d):
         x[member + i] *= noise.keep if i != OFFSET else 1.0
-    move_rows(cov, member, d, (east, north, up), (cos, sin), scale, dt, noise.keep)
-    move_rows(cov.T, member, d, (east, north, up), (cos, sin), scale, dt, noise.keep)
+    half, slow = 0.5 * dt, dt * scale
+    by = (
+        (-north, east, 0.0),
+        (-scale * east, -scale * north, -scale * up),
+        (half * north, -half * east, 0.0),
+        (0.0, 0.0, 0.0),
+        (-cos, -sin, 0.0),
+        (sin, -cos, 0.0),
+        (0.0, 0.0, -slow),
+    )
+    move_rows(cov, member, d, by, dt, noise.keep)
+    move_rows(cov.T, member, d, by, dt, noise.keep)
     symmetrise(cov, member, d)
     cov[member, member] += cos * cos * q[0] + sin * sin * q[1] + more
     cov[member + 1, member + 1] += sin * sin * q[0] + cos * cos * q[1] + more
     cov[member, member + 1] += cos * sin * (q[0] - q[1])
     cov[member + 1, member] += cos * sin * (q[0] - q[1])
-    cov[member + 2, member + 2] += (dt * scale) * (dt * scale) * q[2]
-    effect = (-0.5 * dt * north, 0.5 * dt * east, 0.0, dt)
+    cov[member + 2, member + 2] += slow * slow * q[2]
+    effect = (*by[2], -dt)
     for i in range(4):
         for j in range(4):
             cov[member + i, member + j] += effect[i] * effect[j] * noise.yaw_rate
@@ -81,43 +91,28 @@ def predict(
 
 
 @part
-def move_rows(
-    cov: Floats, member: int, d: int, moved: Three, turn: tuple[float, float], scale: float, dt: float, keep: float
-) -> None:
+def move_rows(cov: Floats, member: int, d: int, by: tuple[Three, ...], dt: float, keep: float) -> None:
     """F P in the rows of a member; the transposed of it, moved once more, is F P F^T.
 
     Args:
         cov: P.
         member: its first number.
         d: numbers of a member.
-        moved: east, north and up m.
-        turn: cosine and sine of the heading, times scale and dt.
-        scale: 1 / (1 + s).
+        by: derivatives of the motion by the numbers behind the position.
         dt: s.
         keep: share of s, b and e that is left.
     """
-    east, north, up = moved
-    for j in range(len(cov)):
-        cov[member, j] -= north * cov[member + HEADING, j]
-        cov[member + 1, j] += east * cov[member + HEADING, j]
-    if d > 4:
+    for i in range(HEADING, d):
+        for c in range(3):
+            f = by[i - HEADING][c]
+            for j in range(len(cov)):
+                cov[member + c, j] += f * cov[member + i, j]
+    for i in range(4, d):
         for j in range(len(cov)):
-            ds, db = -scale * cov[member + 4, j], -dt * cov[member + 5, j]
-            cov[member, j] += east * ds - 0.5 * north * db
-            cov[member + 1, j] += north * ds + 0.5 * east * db
-            cov[member + 2, j] += up * ds
-            cov[member + HEADING, j] += db
-            cov[member + 4, j] *= keep
-            cov[member + 5, j] *= keep
-    if d > SLOW:
-        (cos, sin), e = turn, member + SLOW
-        for j in range(len(cov)):
-            forward, left = cov[e, j], cov[e + 1, j]
-            cov[member, j] -= cos * forward - sin * left
-            cov[member + 1, j] -= sin * forward + cos * left
-            cov[member + 2, j] -= dt * scale * cov[e + 2, j]
-            for i in range(e, e + 3):
-                cov[i, j] *= keep
+            if i == 5:
+                cov[member + HEADING, j] -= dt * cov[member + i, j]
+            if i != OFFSET:
+                cov[member + i, j] *= keep
 
 
 @part
