@@ -12,7 +12,18 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, add_diagonal, choose_each, inner_product, load, scale, store, subtract, zeros
+from ..compiling.small import (
+    add,
+    add_diagonal,
+    choose_each,
+    diagonal,
+    inner_product,
+    load,
+    scale,
+    store,
+    subtract,
+    zeros,
+)
 from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import (
     ANEW,
@@ -30,7 +41,7 @@ from ..gate import (
     vote,
 )
 from ..geometry import Numbers, axes, direction, incomplete, residuals, vector, whole
-from .messages import BLOCK, ROW, VARIANCE, Star, moved_of, position_of, process_of, relative_of, variance_of, vector_at
+from .messages import ROW, VARIANCE, Star, moved_of, position_of, process_of, relative_of, variance_of, vector_at
 
 STATE, BEFORE, VOTES = (0.0,) * 13, (0.0,) * 14, (0.0,) * 9
 
@@ -87,7 +98,7 @@ def fresh(star: Star, k: int, flat: float) -> Numbers:
     o = 0.0 * variance_of(star, 0)[0]
     f, y = o + flat, o + INITIAL_LOCKOUT
     variance = (f, f, f) if k > 0 else variance_of(star, 0)
-    return (*add_diagonal(zeros(o, BLOCK), variance), y, y, y, o)
+    return (*diagonal(variance), y, y, y, o)
 
 
 @inner
@@ -98,7 +109,7 @@ def supporters(star: Star, n: int, at: Numbers, variance: Numbers) -> float:
     for k in range(1, n):
         polar = relative_of(star, k)
         gap, sent = subtract(position_of(star, k), add(at, vector(polar))), variance_of(star, k)
-        q = distance(gap, add_diagonal(zeros(o, BLOCK), add(noise, sent)))
+        q = distance(gap, diagonal(add(noise, sent)))
         agree = agree + choose(o + FIX_GATE - q, choose(o + NO_FIX_M2 - sent[0], whole(polar), o), o)
     return agree
 
@@ -122,7 +133,7 @@ def go_back(star: Star, gates: Gates, state: Floats, n: int) -> Lanes:
     apart, wide, gain = inner_product(gap, gap), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
     what, evidence, since = remember(q, other, FIX_GATE, gain, apart, wide, memory[12], memory[13])
     begins, back, flat = what - 0.5, what - 1.5, o + NOT_REMEMBERED_M2
-    nothing = add_diagonal(zeros(o, BLOCK), (flat, flat, flat))
+    nothing = diagonal((flat, flat, flat))
     kept = choose_each(back, nothing, choose_each(begins, ego[:9], choose_each(what + 0.5, spread, nothing)))
     store(gates.before, 0, (*choose_each(begins, at, there), *kept, evidence, since))
     store(gates.state, 0, (*choose_each(back, spread, ego[:9]), *ego[9:12], choose(back, o, ego[12])))

@@ -343,7 +343,11 @@ def step(
         carry(star, gates, model.flat, n, old)
         back = go_back(star, gates, joint.state, n)
         if not back <= 0.0 * back:
-            place_ego(joint, back, block_at(gates.state, 0), n)
+            o, at = 0.0 * back, (n - 1) * joint.stride + n - 1  # the ego's covariance is replaced
+            q = choose(back, o, o + UNMOVED)
+            predict_block(joint.information, n - 1, n, joint.stride, (q, q, q), joint.scratch)
+            there = inverse(block_at(gates.state, 0))
+            store(joint.information, at, choose_each(back, there, block_at(joint.information, at)))
             begin_anew(star, joint, gates, back - BACK, model.flat, n)
     if not laplacian:
         place_on_broadcast(star, joint, n)
@@ -355,15 +359,6 @@ def step(
     add_fixes(star, joint, n)
     update(star, joint, model, refine, laplacian, n)
     store(gates.state, 0, (*block_at(joint.scratch, 0), *load(gates.state, 0, STATE)[9:]))
-
-
-@inner
-def place_ego(joint: Joint, where: float, cov: Numbers, n: int) -> None:
-    """Replace what is known of the ego by a covariance m^2, where a number is above 0."""
-    o, at = 0.0 * where, (n - 1) * joint.stride + n - 1
-    process = choose(where, o, o + UNMOVED)
-    predict_block(joint.information, n - 1, n, joint.stride, (process, process, process), joint.scratch)
-    store(joint.information, at, choose_each(where, inverse(cov), block_at(joint.information, at)))
 
 
 @inner

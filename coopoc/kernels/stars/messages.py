@@ -177,7 +177,8 @@ def new_estimates(measurements: Measurements) -> Estimates:
 def gather(
     star: Star, before: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int
 ) -> int:
-    """Fill the star of step t for runs first to last, at most LANES, the last one repeated; the number of its members.
+    """Fill the star of step t with last messages, for runs first to last, at most LANES, the last one repeated; the
+    number of its members.
 
     Args:
         star: memory.
@@ -192,11 +193,30 @@ def gather(
     n = 1 + measurements.start[t + 1] - measurements.start[t]
     for k in range(n):
         link = measurements.start[t] + k - 1
-        star.member[k] = member = measurements.ego if k == 0 else measurements.neighbour[link]
-        star.previous[k] = index_of(member, before.member, old)
+        star.member[k] = j = measurements.ego if k == 0 else measurements.neighbour[link]
+        star.previous[k], status = -1, 5 * k
+        for i in range(old):
+            if before.member[i] == j:
+                star.previous[k] = i
+        previous, last_status = star.previous[k], 5 * max(star.previous[k], 0)
         for lane in range(LANES):
             run = min(first + int(lane), last)
-            receive(star, before, measurements, model, run, t, link, k, lane)
+            sent = t if k == 0 else measurements.newest[run, link]
+            when = sent if sent >= 0 else t
+            again = previous >= 0 and before.status[last_status + SENT, lane] == sent
+            star.status[status + SENT, lane] = sent
+            star.status[status + USES, lane] = before.status[last_status + USES, lane] + 1.0 if again else 1.0
+            star.status[status + AGE, lane] = t - when
+            star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
+            at, variance = three_of(measurements.broadcast, run, when, j), three_of(model.broadcast, run, when, j)
+            if k == 0:
+                at, variance = three_of(measurements.gnss, run, when, j), three_of(model.fixes, run, when, j)
+            there = math.isfinite(at[0] + at[1] + at[2])
+            if not there:
+                at, variance = ROW, (NOWHERE, NOWHERE, NOWHERE)
+            velocity, process = three_of(measurements.velocity, run, when, j), three_of(model.process, run, when, j)
+            put_lane(star.motion, 12 * k, lane, (*velocity, *process, *at, *variance))
+            star.status[status + NEW, lane] = 1.0 if there and (k == 0 or measurements.fresh[run, link]) else 0.0
             if k > 0:
                 std = model.relative_std if len(model.relative_std) else UNIT
                 put_lane(star.relative, 8 * k, lane, with_std(measurements.relative[run, link], std))
@@ -209,50 +229,6 @@ def clear(values: Floats) -> None:
     """Fill with zeros."""
     for i in range(len(values)):
         store(values, i, (0.0,))
-
-
-@inside
-def index_of(member: int, members: Ints, count: int) -> int:
-    """Index of a member, -1 if it is not among the first `count`."""
-    index = -1
-    for i in range(count):
-        if members[i] == member:
-            index = i
-    return index
-
-
-@inside
-def receive(
-    star: Star,
-    before: Star,
-    measurements: Measurements,
-    model: Assumptions,
-    run: int,
-    t: int,
-    link: int,
-    k: int,
-    lane: int,
-) -> None:
-    """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
-    previous, status = star.previous[k], 5 * k
-    last = 5 * max(previous, 0)
-    sent = t if k == 0 else measurements.newest[run, link]
-    when = sent if sent >= 0 else t
-    again = previous >= 0 and before.status[last + SENT, lane] == sent
-    star.status[status + SENT, lane] = sent
-    star.status[status + USES, lane] = before.status[last + USES, lane] + 1.0 if again else 1.0
-    star.status[status + AGE, lane] = t - when
-    star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
-    j = star.member[k]
-    at, variance = three_of(measurements.broadcast, run, when, j), three_of(model.broadcast, run, when, j)
-    if k == 0:
-        at, variance = three_of(measurements.gnss, run, when, j), three_of(model.fixes, run, when, j)
-    there = math.isfinite(at[0] + at[1] + at[2])
-    if not there:
-        at, variance = ROW, (NOWHERE, NOWHERE, NOWHERE)
-    velocity, process = three_of(measurements.velocity, run, when, j), three_of(model.process, run, when, j)
-    put_lane(star.motion, 12 * k, lane, (*velocity, *process, *at, *variance))
-    star.status[status + NEW, lane] = 1.0 if there and (k == 0 or measurements.fresh[run, link]) else 0.0
 
 
 @inside

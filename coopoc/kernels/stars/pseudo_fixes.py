@@ -21,7 +21,7 @@ from ..compiling.small import (
     add_diagonal,
     apply,
     choose_each,
-    from_upper,
+    diagonal,
     inner_product,
     inverse,
     minus_product,
@@ -148,7 +148,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
     nothing, flat = zeros(o, BLOCK), o + model.flat
     if old == 0:
         x, w, new = fix, o + 0.5, new if fusion.naive else o
-        add_source(fusion, 0, nothing, add_diagonal(nothing, (flat, flat, flat) if fusion.naive else variance))
+        add_source(fusion, 0, nothing, diagonal((flat, flat, flat) if fusion.naive else variance))
     else:
         x, w = add(vector_at(fusion.x, 0), moved_of(star, 0)), take(fusion.weight, 0)
         independent = add_diagonal(block_at(fusion.independent, 0), process_of(star, 0))
@@ -158,7 +158,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
             share, hits = gate_fix(subtract(fix, x), own, variance, FIX_GATE, hits)
             store(fusion.hits, 0, (hits,))
             variance = scale(variance, share)
-    fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
+    fixed = diagonal((new / variance[0], new / variance[1], new / variance[2]))
     add_neighbours(star, model, fusion, x, n)
     alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
     w = o + 0.5 if fusion.naive else best_weight(fusion, fixed, n, w)
@@ -187,11 +187,11 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
 def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
     """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
     o = 0.0 * x[0]
-    one, nowhere = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0)), (o + math.nan, o + math.nan, o + math.nan)
+    unit, nowhere = o + 1.0, (o + math.nan, o + math.nan, o + math.nan)
     for k in range(1, n):
         gap = subtract(position_of(star, k), x)
         relative, variance = relative_of(star, k), variance_of(star, k)
-        polar, noise, theirs, f = direction(gap), one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
+        polar, noise, theirs, f = direction(gap), diagonal((unit, unit, unit)), diagonal(variance), unit
         if fusion.robust:
             ahead = add(own_cov(fusion), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
@@ -208,7 +208,7 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
-        f = choose(counts, f, o + 1.0)
+        f = choose(counts, f, unit)
         store(fusion.used, k, (choose(has_position, counts, o),))
         store(fusion.gap, k, gap)
         add_source(fusion, k, scale(theirs, f), scale(noise, f))
