@@ -6,12 +6,12 @@ import math
 import numpy as np
 
 from ..arrays import Floats, Ints
-from .compiling.compile import compiled
-from .compiling.small import subtract
+from .compiling.compile import compiled, inside
+from .compiling.small import add, inner_product, over, scale, subtract, times
 from .gate import FIX_GATE, HARD_REJECT_FACTOR
-from .geometry import direction, five, residuals, with_std
+from .geometry import Numbers, direction, five, residuals, with_std
 from .stars.gaussian import distance
-from .stars.messages import BLOCK, block_at, vector_at
+from .stars.messages import BLOCK, ROW, block_at, three_of, vector_at
 
 MAX_CORRELATION2 = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
@@ -69,38 +69,36 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
         marks: (2 or more, E, T) out, 1 where fixes are far, or else contradict covariances.
     """
     runs, steps = gnss.shape[:2]
-    worst, r, p = np.zeros((runs, len(columns))), np.zeros(3), np.zeros(3)
+    worst = np.zeros((runs, len(columns)))
     for run in range(runs):
         for k in range(len(columns)):
-            count, far, mean, first, t = 0, 0, 0.0, 0, 0
-            r[:], p[:] = 0.0, 0.0
+            count, far, mean, first, t, r, p = 0, 0, 0.0, 0, 0, ROW, ROW
             while t < steps:
-                now, t, q, square = t, t + 1, 0.0, 0.0
-                if math.isnan(gnss[run, now, columns[k], 0]):
+                now, t = t, t + 1
+                gap = subtract(three_of(gnss, run, now, columns[k]), three_of(x, run, now, k))
+                if math.isnan(gap[0]):
                     continue
-                first, t = now if count == 0 else first, now + every
-                for c in range(3):
-                    gap = gnss[run, now, columns[k], c] - x[run, now, k, c]
-                    own = cov[run, now, k, c, c] if len(cov) > 0 else 0.0
-                    white, lasts = fix[now, columns[k], 0, c], fix[now, columns[k], 1, c]
-                    r[c], p[c], q = (
-                        r[c] + gap,
-                        p[c] + own + white / JUDGED_IN_A_ROW + lasts,
-                        q + gap * gap / (white + lasts + own),
-                    )
+                white, lasts = three_of(fix, now, columns[k], 0), three_of(fix, now, columns[k], 1)
+                own = ROW
+                if len(cov) > 0:
+                    own = cov[run, now, k, 0, 0], cov[run, now, k, 1, 1], cov[run, now, k, 2, 2]
+                first, t, q = now if count == 0 else first, now + every, squared(gap, add(add(white, lasts), own))
+                r, p = add(r, gap), add(add(p, own), add(scale(white, 1.0 / JUDGED_IN_A_ROW), lasts))
                 count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / JUDGED_IN_A_ROW
-                if count < JUDGED_IN_A_ROW:
-                    continue
-                for c in range(3):
-                    square += r[c] * r[c] / (JUDGED_IN_A_ROW * p[c])
-                    r[c] = p[c] = 0.0
-                worst[run, k] = max(worst[run, k], mean, square)
-                kind = int(far < JUDGED_IN_A_ROW)
-                if kind == 0 or (len(cov) > 0 and max(mean, square) > DOUBT):
-                    for i in range(first, min(t, steps)):
-                        marks[kind, k, i] = 1
-                count, far, mean = 0, 0, 0.0
+                if count == JUDGED_IN_A_ROW:
+                    mean = max(mean, squared(r, p) / JUDGED_IN_A_ROW)
+                    worst[run, k] = max(worst[run, k], mean)
+                    kind = int(far < JUDGED_IN_A_ROW)
+                    if kind == 0 or (len(cov) > 0 and mean > DOUBT):
+                        marks[kind, k, first:t] = 1
+                    count, far, mean, r, p = 0, 0, 0.0, ROW, ROW
     return worst
+
+
+@inside
+def squared(gap: Numbers, variance: Numbers) -> float:
+    """Squared normalised difference."""
+    return inner_product(times(gap, gap), over(variance))
 
 
 @compiled
@@ -131,31 +129,28 @@ def mark_neighbours(
         marks: (2, N, T) out, 1 where they are far: messages, relative measurements.
     """
     for run in range(len(gnss)):
-        counts, gap = np.zeros((gnss.shape[2], 5), np.int64), np.zeros(3)
+        counts = np.zeros((gnss.shape[2], 5), np.int64)
         for i in range(len(links)):
-            link, t, j, own, message = links[i, 0], links[i, 1], links[i, 2], 0.0, 0.0
-            for c in range(3):
-                gap[c] = neighbours[run, i, c] - x[run, t, c]
-                own += (cov[run, t, c, c] + fix[t, j, 1, c]) / 3.0
+            link, t, j = links[i]
+            there, lasts, p = vector_at(neighbours[run, i], 0), three_of(fix, t, j, 1), cov[run, t]
+            gap, own = subtract(there, vector_at(x[run, t], 0)), (p[0, 0] + p[1, 1] + p[2, 2] + sum(lasts)) / 3.0
             if t < counts[j, 0] or math.isnan(gap[0]):
                 continue
-            polar = direction(vector_at(gap, 0))
+            polar = direction(gap)
             measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)
             far, reach = residuals(measured, polar), polar[0] * polar[3]
             q = far[0] ** 2 / (measured[5] ** 2 + own) + (far[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
             q += (far[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
             own += std[0] ** 2 + (polar[0] * std[1]) ** 2
-            for c in range(3):
-                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[t, j, 0, c] + fix[t, j, 1, c] + own)
+            wide = add(add(three_of(fix, t, j, 0), lasts), (own, own, own))
+            message = squared(subtract(three_of(gnss, run, t, j), there), wide)
             counts[j, 2] = t if counts[j, 1] == 0 else counts[j, 2]
             counts[j, 0], counts[j, 1] = t + every, counts[j, 1] + 1
             counts[j, 3] += message > HARD_REJECT_FACTOR * FIX_GATE
             counts[j, 4] += q > HARD_REJECT_FACTOR * FIX_GATE
             if counts[j, 1] == JUDGED_IN_A_ROW:
                 for kind in range(2):
-                    for k in range(
-                        counts[j, 2], min(t + every, len(cov[run])) if counts[j, 3 + kind] == JUDGED_IN_A_ROW else 0
-                    ):
-                        marks[kind, j, k] = 1
+                    if counts[j, 3 + kind] == JUDGED_IN_A_ROW:
+                        marks[kind, j, counts[j, 2] : t + every] = 1
                     counts[j, 3 + kind] = 0
                 counts[j, 1] = 0
