@@ -9,7 +9,7 @@ References:
     acceleration) and 11.6 (static multiple models).
 """
 
-import math
+from math import exp, inf, log, nan, sqrt
 
 import numpy as np
 
@@ -53,15 +53,15 @@ def constant_velocity(
     v, best, prior = np.zeros(3), FIRST_FILTER, PRIOR_COUNT
     score[:, 0], score[:, 1] = prior, prior * variance
     for j in range(count):
-        dt = t[j] - t[j - 1] if j > 0 else math.inf
+        dt = t[j] - t[j - 1] if j > 0 else inf
         if dt > gap:
             for m in range(models):
                 p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, speed * speed / variance
                 for c in range(3):
                     x[m, c], u[m, c] = fixes[j, c], 0.0
-            growth[j] = math.nan
+            growth[j] = nan
             continue
-        keep, most = math.exp(-dt / REMEMBERS), -math.inf
+        keep, most = exp(-dt / REMEMBERS), -inf
         for m in range(models):
             q, (before, b, d) = (bank[m] / interval) ** 4, p[m]
             a = before + 2.0 * dt * b + dt * dt * d + q * dt**3 / 3.0
@@ -73,16 +73,16 @@ def constant_velocity(
                 square += v[c] * v[c]
             numbers, squares, logs = score[m]
             limit = 3.0 * CLIP_STDS**2 * max(squares / numbers, MIN_VARIANCE) * s
-            clip = math.sqrt(limit / square) if square > limit else 1.0
+            clip = sqrt(limit / square) if square > limit else 1.0
             for c in range(3):
                 x[m, c] += clip * a / s * v[c]
                 u[m, c] += clip * b / s * v[c]
             p[m, 0], p[m, 1], p[m, 2] = a / s, b / s, d - b * b / s
             numbers = prior + keep * (numbers - prior) + 3.0
             squares = prior * variance + keep * (squares - prior * variance) + min(square, limit) / s
-            logs = keep * logs + 3.0 * math.log(s)
+            logs = keep * logs + 3.0 * log(s)
             score[m, 0], score[m, 1], score[m, 2] = numbers, squares, logs
-            likely = -0.5 * (numbers * math.log(max(squares / numbers, MIN_VARIANCE)) + logs)
+            likely = -0.5 * (numbers * log(max(squares / numbers, MIN_VARIANCE)) + logs)
             if likely > most:
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):

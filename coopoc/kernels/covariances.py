@@ -1,7 +1,7 @@
 """NEES of a track, e^T P^-1 e by P = L D L^T, covariances that are none, and what contradicts a track, in one pass
 each."""
 
-import math
+from math import isfinite, isnan
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def unsound(cov: Floats) -> int:
             and f * f <= MAX_CORRELATION2 * b * c
         )
         sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - MAX_CORRELATION2) * a * b * c
-        if not (sound and skew <= (MAX_CORRELATION2 - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
+        if not (sound and skew <= (MAX_CORRELATION2 - 1.0) * max(a, b, c) and isfinite(a + b + c)):
             count += 1
     return count
 
@@ -48,8 +48,8 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
     for i in range(len(squares)):
         p, error = block_at(cov, i), subtract(vector_at(x, i), vector_at(truth, i % (truth.size // 3)))
         squares[i] = distance(p, error)[0]
-        if not math.isfinite(squares[i]):
-            sound &= math.isnan(error[0]) or p == BLOCK
+        if not isfinite(squares[i]):
+            sound &= isnan(error[0]) or p == BLOCK
             squares[i] = np.nan
     return squares.reshape(x.shape[:3]), sound
 
@@ -76,7 +76,7 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
             while t < steps:
                 now, t = t, t + 1
                 gap = subtract(three_of(gnss, run, now, columns[k]), three_of(x, run, now, k))
-                if math.isnan(gap[0]):
+                if isnan(gap[0]):
                     continue
                 white, lasts = three_of(fix, now, columns[k], 0), three_of(fix, now, columns[k], 1)
                 own = ROW
@@ -134,7 +134,7 @@ def mark_neighbours(
             link, t, j = links[i]
             there, lasts, p = vector_at(neighbours[run, i], 0), three_of(fix, t, j, 1), cov[run, t]
             gap, own = subtract(there, vector_at(x[run, t], 0)), (p[0, 0] + p[1, 1] + p[2, 2] + sum(lasts)) / 3.0
-            if t < counts[j, 0] or math.isnan(gap[0]):
+            if t < counts[j, 0] or isnan(gap[0]):
                 continue
             polar = direction(gap)
             measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)

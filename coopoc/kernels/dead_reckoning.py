@@ -1,6 +1,6 @@
 """Dead reckoning of one vehicle: its newest motions, which bring a late fix forward."""
 
-import math
+from math import isfinite, isinf, isnan
 
 from ..arrays import Floats
 from .compiling.compile import compiled, part
@@ -84,10 +84,10 @@ def dead_reckon(
     """
     dt, age, missing = row[DT], row[FIX_AGE], 0
     for c in range(3):
-        missing += math.isnan(row[c])
-        if math.isinf(row[c]) or not math.isfinite(row[3 + c]):
+        missing += isnan(row[c])
+        if isinf(row[c]) or not isfinite(row[3 + c]):
             return BAD_INPUT
-    if not (dt > ROUNDING and math.isfinite(dt)) or missing % 3 != 0:
+    if not (dt > ROUNDING and isfinite(dt)) or missing % 3 != 0:
         return BAD_INPUT
     if missing == 0 and not -ROUNDING <= age <= min(history[0, 2] + dt, history[0, 3]) + ROUNDING:
         return BAD_INPUT

@@ -5,8 +5,8 @@ them the three standard deviations, infinite for a missing component, which henc
 vectors e_r, e_a, e_i along which the three grow, the rows of the Jacobian are e_r^T, e_a^T / (r sin i) and e_i^T / r.
 """
 
-import math
 from collections.abc import Sequence
+from math import atan2, cos, inf, isnan, sin, sqrt
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -40,17 +40,17 @@ def five(d: float, azimuth: float, inclination: float) -> Five:
     angle are 0."""
     return (
         or_else(d, -1.0),
-        or_else(math.sin(azimuth), 0.0),
-        or_else(math.cos(azimuth), 0.0),
-        or_else(math.sin(inclination), 0.0),
-        or_else(math.cos(inclination), 0.0),
+        or_else(sin(azimuth), 0.0),
+        or_else(cos(azimuth), 0.0),
+        or_else(sin(inclination), 0.0),
+        or_else(cos(inclination), 0.0),
     )
 
 
 @inside
 def or_else(value: float, missing: float) -> float:
     """Another number for NaN."""
-    return missing if math.isnan(value) else value
+    return missing if isnan(value) else value
 
 
 @inside
@@ -59,11 +59,11 @@ def with_std(measured: Sequence[float] | Floats, std: Sequence[float] | Floats) 
     d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
     a, b, c = std[0], std[1], std[2]
     if d < 0.0:
-        d, a = 0.0, math.inf
+        d, a = 0.0, inf
     if sa == 0.0 and ca == 0.0:
-        ca, b = 1.0, math.inf
+        ca, b = 1.0, inf
     if si == 0.0 and ci == 0.0:
-        si, c = 1.0, math.inf
+        si, c = 1.0, inf
     return d, sa, ca, si, ci, a, b, c
 
 
@@ -79,7 +79,7 @@ def direction(gap: Numbers) -> Five:
     """Polar form of a vector: length, sine and cosine of azimuth and of inclination, 0 and 1 along z."""
     x, y, z = gap
     flat2 = plus(x * x, y, y)
-    flat, d = math.sqrt(flat2), math.sqrt(plus(flat2, z, z))
+    flat, d = sqrt(flat2), sqrt(plus(flat2, z, z))
     o, over, over_d = 0.0 * d, 1.0 / flat, 1.0 / d
     sine, cosine = choose(flat, y * over, o), choose(flat, x * over, o + 1.0)
     return d, sine, cosine, choose(d, flat * over_d, o), choose(d, z * over_d, o + 1.0)
@@ -88,7 +88,7 @@ def direction(gap: Numbers) -> Five:
 @as_written
 def angle(sine: float, cosine: float) -> float:
     """atan2; within 14 degrees by its Taylor series, whose 13 terms are exact to the last bit there."""
-    return series(sine, cosine) if abs(sine) <= 0.25 * cosine else math.atan2(sine, cosine)
+    return series(sine, cosine) if abs(sine) <= 0.25 * cosine else atan2(sine, cosine)
 
 
 @inner
@@ -105,10 +105,10 @@ def series(sine: float, cosine: float) -> Lanes:
 def one_angle(sine: float, cosine: float, k: int) -> float:
     """The `angle` of one run."""
     y, x = lane(sine, k), lane(cosine, k)
-    return series(y, x) if abs(y) <= 0.25 * x else math.atan2(y, x)
+    return series(y, x) if abs(y) <= 0.25 * x else atan2(y, x)
 
 
-@overload(math.atan2)
+@overload(atan2)
 def _of_several_runs(sine: Any, cosine: Any) -> Any:
     """Where not all are small, one by one."""
     if not isinstance(sine, Batched):

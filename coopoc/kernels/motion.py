@@ -1,7 +1,7 @@
 """Process noise of a motion dt u, constant or a share of the pace: of the velocities measured before."""
 
-import math
 from collections.abc import Sequence
+from math import inf, isnan, nan
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -53,7 +53,7 @@ def process_variance(noise: MotionNoise, square: Floats, velocity: Vector, dt: f
         q: out.
     """
     for c in range(3):
-        if math.isnan(square[c]):
+        if isnan(square[c]):
             square[c] = velocity[c] * velocity[c]
     speed, interval = square[0] + square[1] + square[2], noise.interval if noise.interval > 0.0 else dt
     for c in range(3):
@@ -85,7 +85,7 @@ def own_variances(noise: MotionNoise, velocity: Floats, dt: float, first: int = 
     step `first`."""
     use = np.full(velocity.shape[:3], HELD, np.uint8)
     use[:, :first] = UNUSED
-    return process_variances(noise, np.ascontiguousarray(velocity), use, math.inf, dt)
+    return process_variances(noise, np.ascontiguousarray(velocity), use, inf, dt)
 
 
 @compiled
@@ -103,14 +103,14 @@ def process_variances(noise: MotionNoise, velocity: Floats, use: AnyArray, longe
     last = np.zeros(len(square), np.int64)
     runs, steps, vehicles = use.shape
     for run in range(runs):
-        square[:], last[:] = math.nan, 0
+        square[:], last[:] = nan, 0
         for t in range(steps):
             for n in range(vehicles):
                 if use[run, t, n] == UNUSED:
                     continue
                 since = (t - last[n]) * dt
                 for c in range(3):
-                    own[c] = square[n, c] if since <= longest + 1e-9 else math.nan
+                    own[c] = square[n, c] if since <= longest + 1e-9 else nan
                 keep_pace(own, velocity[run, last[n], n], since)
                 process_variance(noise, own, velocity[run, t, n], dt, variance[run, t, n])
                 if use[run, t, n] == HELD:

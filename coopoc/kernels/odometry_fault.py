@@ -15,7 +15,7 @@ References:
     Estimation with applications to tracking and navigation, Wiley 2001, 6.2.2 (white acceleration).
 """
 
-import math
+from math import isnan, log, nan, sqrt
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def new_state(noise: MotionNoise) -> Floats:
     Args:
         noise: of the motion.
     """
-    states = np.full((len(PACES), SIZE), math.nan)
+    states = np.full((len(PACES), SIZE), nan)
     base, ratio = (float(np.square(std[:2]).mean()) for std in (noise.base, noise.ratio))
     for state, pace in zip(states, PACES, strict=True):
         state[BASE:] = base, ratio, noise.floor, noise.interval, *pace
@@ -88,7 +88,7 @@ def correct(states: Floats, velocity: Floats, dt: float) -> float:
         velocity: (3,) m/s.
         dt: s.
     """
-    if len(states) == 0 or math.isnan(states[0, PLACE]):
+    if len(states) == 0 or isnan(states[0, PLACE]):
         return 0.0
     for i in range(len(states)):
         states[i, WAY] += dt * velocity[0]
@@ -108,7 +108,7 @@ def correct(states: Floats, velocity: Floats, dt: float) -> float:
 def judge(states: Floats, x: float, y: float, r: float, dt: float) -> float:
     """Take a fix, m, NaN for none, whose axes have the variance r m^2; by how many m^2 the position is more uncertain
     than the odometry says if it has failed from now on."""
-    if len(states) == 0 or math.isnan(x):
+    if len(states) == 0 or isnan(x):
         return 0.0
     before, gap2 = failing(states), 0.0
     for i in range(len(states)):
@@ -119,7 +119,7 @@ def judge(states: Floats, x: float, y: float, r: float, dt: float) -> float:
 @part
 def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     """The square, m^2, of the gap between both filters of a pace at a fix from which on the odometry fails, else 0."""
-    if math.isnan(state[PLACE]):
+    if isnan(state[PLACE]):
         for i in range(BASE):
             state[i] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE_UNTIL], state[LEVEL] = r, 1.0, r, UNKNOWN
@@ -146,7 +146,7 @@ def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
         return 0.0
     gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
-    least = max(state[SHARE] * state[PATH], state[RATE] * state[LASTS], min(state[STDS] * math.sqrt(r), MAX_WANDER_M))
+    least = max(state[SHARE] * state[PATH], state[RATE] * state[LASTS], min(state[STDS] * sqrt(r), MAX_WANDER_M))
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0
@@ -193,10 +193,10 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2] = share * r, (1.0 - share) * pb, bb
     state[SURE_UNTIL] = trust * r
     state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, MAX_Q) - 1.0)), 1.0)
-    state[LIKELY] = LIKELY_KEPT * state[LIKELY] - 0.5 * min(square, MAX_Q) - math.log(s)
+    state[LIKELY] = LIKELY_KEPT * state[LIKELY] - 0.5 * min(square, MAX_Q) - log(s)
     state[LASTS] += time
-    state[PATH] += time * math.sqrt(speed2)
-    more = 0.5 * (min(believed, MAX_Q) - min(square, MAX_Q)) + math.log(wide / s)
+    state[PATH] += time * sqrt(speed2)
+    more = 0.5 * (min(believed, MAX_Q) - min(square, MAX_Q)) + log(wide / s)
     more -= state[ANEW] if anew else 0.0
     too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > state[RATE] ** 2
     state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MAX_EVIDENCE)
@@ -231,9 +231,9 @@ def correct_drives(
                 n, extra, state = columns[e], 0.0, states[e]
                 measured = velocity[run, t, n]
                 moved[0], moved[1] = measured[0], measured[1]
-                if math.isnan(moved[0]):
+                if isnan(moved[0]):
                     for i in range(len(state)):
-                        state[i, PLACE] = math.nan
+                        state[i, PLACE] = nan
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)

@@ -4,7 +4,7 @@ Its state is the votes of `gate.vote`, four vectors, position m and variance m^2
 that `gate.remember` is about, the hits of fixes beyond the gate, and the evidence and the time of that memory.
 """
 
-import math
+from math import inf, isinf, isnan
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -74,7 +74,7 @@ def off(state: Floats, k: int, moved: Vector, fix: Vector, noise: Vector) -> flo
     q = 0.0
     for c in range(3):
         gap = fix[c] - state[3 * k + c] - moved[c]
-        if not math.isnan(gap):
+        if not isnan(gap):
             q += gap * gap / (state[3 * k + 3 + c] + noise[c] + SLIP_M2)
     return q
 
@@ -90,13 +90,13 @@ def gate_fix(state: Floats, moved: Vector, process: Vector, fix: Vector, noise: 
             store(state, X, subtract(fix, moved))
             store(state, P, noise)
             store(state, MEMORY, ROW)
-            return math.inf
+            return inf
     q, hits, gain = off(state, X, moved, fix, noise), state[HITS], 0.0
     if q <= gate and hits == 0.0 and state[3 * SPREAD] >= NOT_REMEMBERED_M2:
         return 1.0
     x, p, before, spread = load(state, X, ROW), load(state, P, ROW), load(state, BEFORE, ROW), load(state, SPREAD, ROW)
     for c in range(3):
-        gain += 0.0 if math.isnan(fix[c]) else p[c] / (3.0 * (p[c] + noise[c]))
+        gain += 0.0 if isnan(fix[c]) else p[c] / (3.0 * (p[c] + noise[c]))
     gap, other = subtract(before, x), off(state, BEFORE, moved, fix, noise)
     apart, evidence, since = inner_product(gap, gap), state[EVIDENCE], state[SINCE]
     what, state[EVIDENCE], state[SINCE] = remember(q, other, gate, gain, apart, sum(spread), evidence, since)
@@ -126,7 +126,7 @@ def step(state: Floats, moved: Vector, process: Vector, fix: Vector, noise: Vect
     for k in (X, BEFORE):
         store(state, k, add(load(state, k, ROW), moved))
     for c in range(3):
-        if not (math.isnan(fix[c]) or math.isinf(f)):
+        if not (isnan(fix[c]) or isinf(f)):
             x, p = state[3 * X + c], state[3 * P + c]
             k = p / (p + f * noise[c])
             state[3 * X + c] = x + k * (fix[c] - x)
@@ -177,7 +177,7 @@ def filter_runs(
                 fix, r = three(measurements.gnss[run, t, n]), three(measurements.fixes[t, e])
                 if t == 0 and exact:
                     begin(state, three(x[run, 0, at]), ROW, CONFIRMED)
-                elif t == 0 or math.isnan(state[3 * X] + moved[0]):
+                elif t == 0 or isnan(state[3 * X] + moved[0]):
                     begin(state, fix, r, 1.0)
                 else:
                     f = step(state, moved, three(q), fix, r, gate)
@@ -204,7 +204,7 @@ def stream_step(row: Floats, state: Floats, history: Floats, odometry: Floats, n
     motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
     q, late, moved, by_fixes = np.empty(3), np.zeros(3), np.zeros(3), np.zeros(4)
     outcome = dead_reckon(row, history, motion, noise[9:12], odometry, answer, q, moved, late, by_fixes)
-    starts = math.isnan(state[3 * X])
+    starts = isnan(state[3 * X])
     if outcome == BAD_INPUT or (starts and outcome == NO_FIX_YET):
         return outcome
     fix, r = add(three(row), three(moved)), add(three(noise[9:]), three(late))

@@ -1,6 +1,6 @@
 """Extended Kalman filter of poses: one vehicle, or a fleet in one state or by fusion of pairs of estimates."""
 
-import math
+from math import inf, isnan
 from typing import NamedTuple
 
 import numpy as np
@@ -122,18 +122,18 @@ def step(
             for s in range(t):
                 again += measured.active[s + 1, k] and not measured.active[s, k]
             for i in range(4 if again < begin.shape[1] else 0):
-                if not math.isnan(begin[run, again, k, i]):
+                if not isnan(begin[run, again, k, i]):
                     poses.x[member + i] = begin[run, again, k, i]
                     poses.cov[member + i, member + i] = spread[i] * spread[i]
     for k in range(members):
         own = measured.own[run, t, k]
-        if active[k] and not math.isnan(own[0]):
-            if not math.isnan(own[3]):  # else it may be the heading that is wrong
+        if active[k] and not isnan(own[0]):
+            if not isnan(own[3]):  # else it may be the heading that is wrong
                 lost = judge(faults[k], own[0], own[1], 0.5 * (noise.fix[0] + noise.fix[1]), measured.dt)
                 poses.cov[d * k, d * k] += lost
                 poses.cov[d * k + 1, d * k + 1] += lost
             update_fix(poses, d * k, own, noise.fix, noise.gate)
-        if active[k] and not math.isnan(own[3]):
+        if active[k] and not isnan(own[3]):
             update_heading(poses, d * k, own[3], noise.heading, noise.gate)
     apply_pending_rows(poses)
     if measured.first[t] == measured.first[t + 1]:
@@ -197,7 +197,7 @@ def fuse_pair(measured: PoseMeasurements, noise: PoseNoise, poses: Poses, pair: 
     ends = (ZERO, d if other >= 0 else ALONE, 2 * d)
     tags = measured.tags[measured.ends[k, 0]], measured.tags[measured.ends[k, 1]]
     tries = WEIGHTS_TRIED if noise.fusion == INTERSECTION and other >= 0 else 0
-    best, chosen = math.inf, 1.0
+    best, chosen = inf, 1.0
     for attempt in range(tries + 1):
         weight = chosen if attempt == tries else (attempt + 1.0) / WEIGHTS_TRIED
         pair.cov[:], pair.hits[:] = 0.0, 0.0

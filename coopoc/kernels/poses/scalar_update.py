@@ -7,7 +7,7 @@ of one member and those offsets, (a, b, c, h, e), and at most in the pose of ano
 here is one of the vector between the two, or between their tags, and of headings.
 """
 
-import math
+from math import atan2, cos, floor, inf, isfinite, isinf, isnan, log, pi, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy import uint64
 
 from ...arrays import Floats
 from ..compiling.compile import inside, part
+from ..compiling.small import from_upper
 from ..compiling.vectors import LANES, less, plus, put, take
 from ..gate import FIX_GATE, GATE, count, gate_fix, inflation
 from ..geometry import Numbers, axes, direction
@@ -158,10 +159,10 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     s = variance + along(columns[pending], ends, row)
     square, hits = residual * residual / s, poses.hits[k + 1]
     share = inflation(square, gate, hits)
-    if math.isfinite(gate):
+    if isfinite(gate):
         poses.hits[k + 1] = count(square, gate, hits, 1.0 - variance / s)
-    poses.totals[COST] += min(square, gate) + math.log(s)
-    if math.isinf(share):
+    poses.totals[COST] += min(square, gate) + log(s)
+    if isinf(share):
         return False
     weight = 1.0 / (s * share)
     for tile in range(tiles):
@@ -217,7 +218,7 @@ def apply_pending_rows(poses: Poses) -> None:
 @part
 def wrapped(angle: float) -> float:
     """The same angle in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+    return angle - 2.0 * pi * floor((angle + pi) / (2.0 * pi))
 
 
 @part
@@ -231,22 +232,22 @@ def update_heading(poses: Poses, member: int, heading: float, variance: float, g
 def update_fix(poses: Poses, member: int, fix: Floats, variance: Three, gate: float) -> None:
     """A position m, gated as a whole."""
     share, m, cov, hits = 1.0, member, poses.cov, poses.hits
-    if math.isfinite(gate):
+    if isfinite(gate):
         apply_pending_rows(poses)
         gap = fix[0] - poses.x[m], fix[1] - poses.x[m + 1], fix[2] - poses.x[m + 2]
-        xy, xz, yz = cov[m, m + 1], cov[m, m + 2], cov[m + 1, m + 2]
-        own = cov[m, m], xy, xz, xy, cov[m + 1, m + 1], yz, xz, yz, cov[m + 2, m + 2]
+        xx, xy, xz = cov[m, m], cov[m, m + 1], cov[m, m + 2]
+        own = from_upper((xx, xy, xz, cov[m + 1, m + 1], cov[m + 1, m + 2], cov[m + 2, m + 2]))
         share, hits[m] = gate_fix(gap, own, variance, FIX_GATE / GATE * gate, hits[m])
-    for axis in range(3 if math.isfinite(share) else 0):
+    for axis in range(3 if isfinite(share) else 0):
         row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0, 0.0)
-        update_row(poses, (member, ALONE, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
+        update_row(poses, (member, ALONE, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], inf)
 
 
 @part
 def rotated(tag: Floats, heading: float) -> Three:
     """East, north and up of what is forward, left and up."""
-    cos, sin = math.cos(heading), math.sin(heading)
-    return cos * tag[0] - sin * tag[1], sin * tag[0] + cos * tag[1], tag[2]
+    c, s = cos(heading), sin(heading)
+    return c * tag[0] - s * tag[1], s * tag[0] + c * tag[1], tag[2]
 
 
 @part
@@ -269,9 +270,9 @@ def relative_row(
         return measured - d, (-x, -y, -z, x * north - y * east, longer, y * right - x * ahead)
     if component == 1:
         flat = max(d * polar[3], MIN_ANGLE_DISTANCE)
-        residual = wrapped(measured - math.atan2(polar[1], polar[2]) + heading)
+        residual = wrapped(measured - atan2(polar[1], polar[2]) + heading)
         return residual, (-side[0] / flat, -side[1] / flat, 0.0, -1.0, 0.0, 0.0)
-    return wrapped(measured - math.atan2(polar[3], polar[4])), (-up[0] / d, -up[1] / d, -up[2] / d, 0.0, 0.0, 0.0)
+    return wrapped(measured - atan2(polar[3], polar[4])), (-up[0] / d, -up[1] / d, -up[2] / d, 0.0, 0.0, 0.0)
 
 
 @part
@@ -306,7 +307,7 @@ def update_relative(
     polar, heading = direction((x, y, z)), linear[k + HEADING]
     curved = curvature(poses.prior_cov, ends, polar)
     for component in range(3):
-        if math.isnan(measured[component]) or left_out & (1 << component):
+        if isnan(measured[component]) or left_out & (1 << component):
             continue
         to = polar if component else between
         residual, row = relative_row(to, heading, (own, other), component, measured[component], noise.longer)

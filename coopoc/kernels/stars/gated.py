@@ -5,7 +5,7 @@ vector from the ego, which the member's own relative measurements and both motio
 a gate is never tighter than that of the exact innovation.
 """
 
-import math
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -163,7 +163,7 @@ def gate_star(star: Star, gates: Gates, state: Floats, placed: Floats, least: fl
         at, polar, memory = vector_at(state, k), relative_of(star, k), load(gates.state, k, STATE)
         std = polar[5:]
         if incomplete(polar):
-            far = o + math.inf
+            far = o + inf
             std = choose_each(take(placed, k) - 0.5, std, (far, far, far))
         cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], polar, std, memory[9:12], least)
         store(gates.state, k, (*cov, *three, o))
@@ -215,4 +215,4 @@ def gate_components(
     cov, moved, f, first = gated_update(cov, zeros(a, ROW), ray, longer, a * a, hits[0])
     cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
     cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
-    return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third)
+    return cov, moved, (sqrt(f), sqrt(g), sqrt(h)), (first, second, third)

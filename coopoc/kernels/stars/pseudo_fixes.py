@@ -9,7 +9,7 @@ and w makes the trace of P = (F + sum of L)^-1 least, F the information that dep
 convex function, by Newton's method within brackets from the weight of the step before. LANES runs side by side.
 """
 
-import math
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -187,7 +187,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
 def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
     """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
     o = 0.0 * x[0]
-    unit, nowhere = o + 1.0, (o + math.nan, o + math.nan, o + math.nan)
+    unit, nowhere = o + 1.0, (o + nan, o + nan, o + nan)
     for k in range(1, n):
         gap = subtract(position_of(star, k), x)
         relative, variance = relative_of(star, k), variance_of(star, k)

@@ -4,7 +4,7 @@ Times are in seconds, and any dt will do: a velocity that has served for L s and
 (L + dt)^2 - L^2 times its own variance.
 """
 
-import math
+from math import isfinite, nan
 
 import numpy as np
 
@@ -92,10 +92,10 @@ def stream_rows(
         q[c] -= own[MORE]
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
-        if math.isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:
+        if isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:
             gap = sent - newest[AGE]
             if gap > max_age + ROUNDING:
-                newest[STEP:TYPICAL] = math.nan
+                newest[STEP:TYPICAL] = nan
             else:
                 keep_pace(newest[STEP:TYPICAL], newest[SPEED:STEP], gap)
             newest[SOLO:STEP], newest[AGE] = row[SOLO:STEP], sent
@@ -125,10 +125,10 @@ def stream_step(
         answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
     """
     if f.g.vectors[0] == 0:
-        if not (is_placed(own, rows, len(vehicles)) or math.isfinite(start[0])):
+        if not (is_placed(own, rows, len(vehicles)) or isfinite(start[0])):
             return False
         begin(f, model, own, rows, len(vehicles), 0)
-        if math.isfinite(start[0]):
+        if isfinite(start[0]):
             f.ego[STEPS], f.ego[VOTES + 7], f.member[0, EXTRA_VARIANCE] = 1, CONFIRMED, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
@@ -138,7 +138,7 @@ def stream_step(
     for i in range(len(vehicles)):
         k = f.slot[vehicles[i]]
         for c in range(3):
-            answer[12 + 3 * i + c] = f.member[k, AT + c] if k >= 0 else math.nan
+            answer[12 + 3 * i + c] = f.member[k, AT + c] if k >= 0 else nan
     return True
 
 
