@@ -84,27 +84,27 @@ def _watch() -> None:
     from numba.core import event
 
     class Watcher(event.Listener):
-        timers: list[threading.Timer] = []  # noqa: RUF012
-        collects = True
-        began = 0.0
+        timer: threading.Timer
+        depth, collects, began = 0, True, 0.0
 
         def on_start(self, event: Any) -> None:
-            title = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
-            line = f"compiling the {title} kernel, once per machine"
-            self.timers.append(threading.Timer(QUIET_SECONDS, print, [line], {"file": sys.stderr}))
-            if len(self.timers) == 1:
-                self.began = clock()
-                self.timers[0].daemon = True
-                self.timers[0].start()
-                self.collects = gc.isenabled()
+            if self.depth == 0:
+                title = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
+                line = f"compiling the {title} kernel, once per machine"
+                self.timer = threading.Timer(QUIET_SECONDS, print, [line], {"file": sys.stderr})
+                self.timer.daemon = True
+                self.timer.start()
+                self.began, self.collects = clock(), gc.isenabled()
                 gc.disable()
+            self.depth += 1
 
         def on_end(self, event: Any) -> None:
-            self.timers.pop().cancel()
-            if not self.timers:
+            self.depth -= 1
+            if self.depth == 0:
+                self.timer.cancel()
                 spent.compile += clock() - self.began
-            if self.collects and not self.timers:
-                gc.enable()
+                if self.collects:
+                    gc.enable()
 
     event.register("numba:compile", Watcher())
 

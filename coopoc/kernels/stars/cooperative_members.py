@@ -128,12 +128,12 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
         g.p[c, c] += own[MOTION_VARIANCE + c]
     slip(f, model, own)
     for k in range(len(f.who)):
-        if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
+        if has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
             if trusted:
                 stretch(g, i, keep - 1.0)
             widen(g, i, model.own * fades)
-        if k > 0 and f.who[k, VEHICLE] >= 0 and has(g, k, RANGED):
+        if k > 0 and has(g, k, RANGED):
             i, holds = 3 * g.block[k, RANGED], math.exp(-own[DT] / PAIR_TIME)
             stretch(g, i, holds - 1.0)
             g.p[i, i] += (1.0 - holds * holds) * model.ranged[1]

@@ -27,7 +27,6 @@ from .gaussian import (
     insert,
     insert_error,
     new_gaussian,
-    new_rows,
     remove,
     widen,
 )
@@ -179,9 +178,10 @@ class Filter(NamedTuple):
 @storage
 def new_filter(slots: int, vehicles: int) -> Filter:
     """A filter before its first step; vehicle 0 .. vehicles - 1."""
+    g, h = new_gaussian(slots)
     return Filter(
-        new_gaussian(slots),
-        new_rows(slots),
+        g,
+        h,
         np.full((slots, WHO), ABSENT),
         np.zeros((slots, MEMBER)),
         np.full(vehicles, ABSENT),

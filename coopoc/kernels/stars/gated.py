@@ -22,6 +22,7 @@ from ..compiling.small import (
     scale,
     store,
     subtract,
+    times,
     zeros,
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
@@ -40,7 +41,7 @@ from ..gate import (
     remember,
     vote,
 )
-from ..geometry import Numbers, axes, direction, incomplete, residuals, vector, whole
+from ..geometry import Numbers, axes, direction, incomplete, metres, residuals, vector, whole
 from .messages import ROW, VARIANCE, Star, moved_of, position_of, process_of, relative_of, variance_of, vector_at
 
 STATE, BEFORE, VOTES = (0.0,) * 13, (0.0,) * 14, (0.0,) * 9
@@ -208,11 +209,10 @@ def gate_components(
     """
     polar = direction(gap)
     ray, side, up = axes(polar)
-    longer, turned, raised = residuals(measured, polar)
-    reach = max(polar[0], least)
-    flat = max(abs(polar[3]), 1e-3) * reach
-    a, b, c = std[0], std[1] * flat, std[2] * reach
+    lengths = metres(polar, (1.0, 1.0, 1.0), least)
+    longer, turned, raised = times(residuals(measured, polar), lengths)
+    a, b, c = times(std, lengths)
     cov, moved, f, first = gated_update(cov, zeros(a, ROW), ray, longer, a * a, hits[0])
-    cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
-    cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
+    cov, moved, g, second = gated_update(cov, moved, side, turned, b * b, hits[1])
+    cov, moved, h, third = gated_update(cov, moved, up, raised, c * c, hits[2])
     return cov, moved, (sqrt(f), sqrt(g), sqrt(h)), (first, second, third)

@@ -81,18 +81,12 @@ class Rows(NamedTuple):
 
 
 @storage
-def new_gaussian(members: int) -> Gaussian:
-    """Room for all vectors of that many members."""
+def new_gaussian(members: int) -> tuple[Gaussian, Rows]:
+    """Room for all vectors of that many members, and for rows of them."""
     size = 12 * (1 + KINDS * members // 4)
     block = np.full((members, KINDS), ABSENT)
-    return Gaussian(np.zeros(size), np.zeros((size, size)), block, np.zeros(1 + KINDS * members, np.int64))
-
-
-@storage
-def new_rows(members: int) -> Rows:
-    """Room for three numbers."""
-    gain = np.zeros(36 * (1 + KINDS * members // 4))
-    return Rows(np.zeros(THREE), np.zeros(MATRIX), np.zeros(MEASURED + 3, np.int64), gain)
+    g = Gaussian(np.zeros(size), np.zeros((size, size)), block, np.zeros(1 + KINDS * members, np.int64))
+    return g, Rows(np.zeros(THREE), np.zeros(MATRIX), np.zeros(MEASURED + 3, np.int64), np.zeros(3 * size))
 
 
 @inside

@@ -165,7 +165,7 @@ def average(f: Filter, model: Model) -> None:
         for d in range(3):
             ego[COVARIANCE + 3 * c + d] = g.p[c, d]
     for k in range(len(f.who) - 1, -1, -1):
-        if f.who[k, VEHICLE] >= 0 and has(g, k, TURN):
+        if has(g, k, TURN):
             for c in range(3):
                 few[n + c, where] = 3 * g.block[k, TURN] + c
             n += 3
