@@ -143,8 +143,7 @@ def read_bag(
         raise InputError(path.name, "0 messages", allowed, "Check the topics with: ros2 bag info.")
     rows = pd.concat(parts).sort_values("row", kind="stable")
     by, turns = rows.index.get_level_values(0).map(what), rows["kind"] == "yaw_rate"
-    gyros = rows["vehicle"][turns & (by == "imu")]
-    rows = rows[~(turns & (by == "odometry") & rows["vehicle"].isin(gyros))]
+    rows = rows[~(turns & (by == "odometry") & rows["vehicle"].isin(rows["vehicle"][turns & (by == "imu")]))]
     return _by_number(rows.reset_index(drop=True), summary)
 
 

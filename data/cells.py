@@ -163,8 +163,7 @@ def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     try:
         values = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
-        texts = cells.map(lambda cell: str(cell)[:300])
-        values = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
+        values = pd.to_numeric(cells.map(lambda cell: str(cell)[:300]), errors="coerce").to_numpy(dtype=float)
     _refuse(cells, ~(abs(values) <= MAX_NUMBER), file, PLAIN)
     return values
 

@@ -125,8 +125,7 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
         print(f"check: {warning.replace(f': {log.summary.columns}.', ', as listed above.')}")
     for what in result.unseen:
         print(f"not seen: {what}")
-    drawn = plot_recording(result.log.recording, step=0)
-    figure = plot_track(result.track, drawn, fleet=result.log.truth).figure
+    figure = plot_track(result.track, plot_recording(result.log.recording, step=0), fleet=result.log.truth).figure
     write(out, partial(figure.canvas.print_figure, format=out.suffix[1:]))
     print(f"picture: {out}", file=sys.stderr)
 

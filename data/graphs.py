@@ -61,8 +61,7 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
     one, other = who[ranges.nodes.T]
     measured = {"range": ranges.distance, "range_std": np.sqrt(ranges.variance)}
     parts.append({"t": ranges.stamps, "vehicle": one, "partner": other, **measured})
-    heading = {"heading": graph.orientation[graph.is_pose, 0], "true": 1.0}
-    for rows, more in ((marks, {}), (graph.is_pose, heading)):
+    for rows, more in ((marks, {}), (graph.is_pose, {"heading": graph.orientation[graph.is_pose, 0], "true": 1.0})):
         at = {"t": graph.stamps[rows], "x": position[rows, 0], "y": position[rows, 1]}
         parts.append({"vehicle": who[rows], **at, **more})
     others = (graph.relative_point, graph.pose_prior, graph.point_prior, edges)

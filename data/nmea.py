@@ -87,8 +87,7 @@ class _Sentences:
                 raise ValueError("latitude and longitude must be ddmm.mmm and dddmm.mmm")
             if not s.quality or s.lat == "" or s.lon == "":
                 return "fixes of quality 0"
-            values = [s.lat, s.lon, float(s.alt or 0.0) + float(s.sep or 0.0)]
-            row = dict(zip(FIX, map(float, values), strict=True))
+            row = dict(zip(FIX, map(float, [s.lat, s.lon, float(s.alt or 0.0) + float(s.sep or 0.0)]), strict=True))
         elif s.msgID == "GST":
             stds = [float(std) for std in (s.stdLat, s.stdLong, s.stdAlt)]
             row = {f"{kind}_std": std if std > 0 else np.nan for kind, std in zip(FIX, stds, strict=True)}

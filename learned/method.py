@@ -121,5 +121,4 @@ class LearnedGain(Alone):
 
 def _lanes(array: Floats) -> Tensor:
     """(R E, T, 3) for the net of (R, T, E, 3)."""
-    flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], 3)
-    return torch.from_numpy(np.ascontiguousarray(flat, np.float32))
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], 3), np.float32))

@@ -50,20 +50,20 @@ class Task:
 
     Args:
         name: of the task.
-        data: bundled fleet.
         sensors: the noise that acts and that methods may know.
         v2x: neighbourhood and channel.
         attack: on the vehicles that are no egos; methods do not know of it.
+        data: bundled fleet.
         seed: of all draws.
         runs: noise draws.
         egos: evenly spaced over the fleet.
     """
 
     name: str
-    data: str
     sensors: Sensors
-    v2x: V2X
+    v2x: V2X = V2X(max_neighbours=6)
     attack: Spoofing = Spoofing(0.0)
+    data: str = "town10"
     seed: int = 2026
     runs: int = 10
     egos: int = 5
@@ -76,7 +76,6 @@ class Task:
 
 
 WHITE = Sensors.paper_scenario2()
-IDEAL = V2X(max_neighbours=6)
 CAM = replace(V2X.cam(6), latency=0.1, loss=0.3)
 BIASED_COMPASS = replace(WHITE, heading_std=float(np.deg2rad(2)), heading_bias_std=float(np.deg2rad(3)))
 LASTING_ERRORS = replace(WHITE, gnss_std=(1.5, 1.5, 1.5), gnss_drift_std=2.5, gnss_common_std=1.5)
@@ -86,18 +85,18 @@ CANYON = replace(WHITE, outliers=Outliers.urban_canyon())
 STORM = replace(BIASED_COMPASS, outliers=LONG_RANGES)
 FIFTH, LATER = Spoofing(0.2), Spoofing(0.2, start=30.0)
 TASKS = (
-    Task("alone", "town10", Sensors.paper_scenario1(), V2X(0)),
-    Task("paper", "town10", WHITE, IDEAL),
-    Task("elsewhere", "town04", WHITE, IDEAL),
-    Task("lasting", "town10", LASTING_ERRORS, IDEAL),
-    Task("field", "town10", WHITE, CAM),
-    Task("heading", "town10", BIASED_COMPASS, IDEAL),
-    Task("outliers", "town10", MISTAKEN, IDEAL),
-    Task("canyon", "town10", CANYON, IDEAL),
-    Task("spoofed", "town10", WHITE, IDEAL, FIFTH),
-    Task("spoofed-40", "town10", WHITE, IDEAL, Spoofing(0.4)),
-    Task("attacked", "town10", WHITE, IDEAL, LATER),
-    Task("storm", "town10", STORM, CAM, FIFTH),
+    Task("alone", Sensors.paper_scenario1(), V2X(0)),
+    Task("paper", WHITE),
+    Task("elsewhere", WHITE, data="town04"),
+    Task("lasting", LASTING_ERRORS),
+    Task("field", WHITE, CAM),
+    Task("heading", BIASED_COMPASS),
+    Task("outliers", MISTAKEN),
+    Task("canyon", CANYON),
+    Task("spoofed", WHITE, attack=FIFTH),
+    Task("spoofed-40", WHITE, attack=Spoofing(0.4)),
+    Task("attacked", WHITE, attack=LATER),
+    Task("storm", STORM, CAM, FIFTH),
 )
 """The test: parameters of a method are never chosen on it."""
 VALIDATION = tuple(replace(task, data="town10-validation", seed=1) for task in TASKS)
@@ -244,5 +243,4 @@ def blocks_of(error: Floats, start: int, length: float) -> Floats:
     """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
     size = max(int(length), 1)
     parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
-    errors = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
-    return errors.T
+    return np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()]).T

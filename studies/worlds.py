@@ -154,8 +154,7 @@ def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:
     count = travelled.shape[1]
     along = travelled - np.cumsum(rng.uniform(*gap, count))
     across = 3.5 * rng.integers(0, 2, count) + 0.3 * np.sin(along / 40.0 + rng.uniform(0, 6, count))
-    incline = rng.uniform(-0.04, 0.04)
-    return turned(np.stack([along, across, incline * along], axis=-1), np.array(rng.uniform(-pi, pi)))
+    return turned(np.stack([along, across, rng.uniform(-0.04, 0.04) * along], axis=-1), np.array(rng.uniform(-pi, pi)))
 
 
 def _platoon(rng: Draws, t: Floats, _: Split) -> Floats:
@@ -184,8 +183,7 @@ def _crossing(rng: Draws, t: Floats, _: Split) -> Floats:
     count = int(rng.integers(8, 17))
     speed, passes = rng.uniform(4.0, 12.0, count), np.sort(rng.uniform(0.0, t[-1], count))
     along, side = speed * (t[:, None] - passes), rng.uniform(2.0, 6.0, count)
-    lane = _points(rng, along, side)
-    return turned(lane, np.broadcast_to(pi / 2 * rng.integers(0, 4, count), along.shape))
+    return turned(_points(rng, along, side), np.broadcast_to(pi / 2 * rng.integers(0, 4, count), along.shape))
 
 
 def _standing(rng: Draws, t: Floats, _: Split) -> Floats:

@@ -128,8 +128,7 @@ def rearranged(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "swapped bytes", all_of(lambda a: a.astype(a.dtype.newbyteorder()))
     yield "writeable", all_of(np.array)
     yield "lists", all_of(lambda a: a.tolist())
-    small = {name: same[name].astype(np.int16) for name in ("arrival", *COLUMNS)}
-    yield "small integers", small
+    yield "small integers", {name: same[name].astype(np.int16) for name in ("arrival", *COLUMNS)}
     yield "unsigned links", {name: same[name].astype(np.uint64) for name in COLUMNS}
 
 

@@ -62,8 +62,7 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         fixed = fixed[(fixed < begin) | (fixed > end)]
         scale, late = 1 + get("wheels", {}).get(name, 0.0), get("late", 0.0)
         if not robots:
-            fixes = at(place[name], fixed)[:, : len(axes)]
-            add(name, fixed + late, axes, fixes, fix)
+            add(name, fixed + late, axes, at(place[name], fixed)[:, : len(axes)], fix)
         if drones:
             u = (at(place[name], moved + 0.05) - at(place[name], moved - 0.05)) / 0.1
             along = (u @ [1, 1j, 0]) * np.exp(-1j * body * at(course[name], moved)[:, 0])

@@ -26,8 +26,7 @@ def test_a_recording_comes_back_from_its_rows(tmp_path, suffix):
     """Fixes, velocities, relative measurements and messages; late and lost ones, too. Velocities are means over steps
     of samples joined by lines, so those of the rows are made such that their means are the recording's."""
     true = observed(drive(start=1.7e9), rate=5.0, latency=0.25, loss=0.2)
-    frame = long(true)
-    log = read_log(write(frame, tmp_path / f"log.{suffix}"))
+    log = read_log(write(long(true), tmp_path / f"log.{suffix}"))
     found = log.recording
     assert found.ids == true.ids
     assert_allclose(found.t, true.t, rtol=0, atol=1e-6)
@@ -202,8 +201,7 @@ def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path):
     kept = np.isfinite(rec.relative).sum()
     assert refused[one[0]][0] + kept == frame["kind"].isin(["range", "azimuth", "inclination"]).sum()
     assert rec.stretches("car2") == ((0, 52), (120, 200))
-    bridged = read_log(tmp_path / "log.csv", max_gap=8.0).recording
-    assert bridged.stretches("car2") == ((0, 200),)
+    assert read_log(tmp_path / "log.csv", max_gap=8.0).recording.stretches("car2") == ((0, 200),)
 
 
 def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):

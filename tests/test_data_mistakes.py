@@ -303,8 +303,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
 def test_two_drives_of_a_file_stay_a_day_apart(tmp_path):
     drive = pd.DataFrame({"t": np.arange(20.0), "x": np.arange(20.0), "y": 0.0, "vx": 1.0, "vy": 0.0})
     pd.concat([drive, drive.assign(t=drive["t"] + 86400)]).to_csv(tmp_path / "a.csv")
-    recording = co.read_log(tmp_path / "a.csv").recording
-    assert np.isfinite(recording.gnss[0, :, 0, 0]).sum() == 40
+    assert np.isfinite(co.read_log(tmp_path / "a.csv").recording.gnss[0, :, 0, 0]).sum() == 40
 
 
 def test_a_header_may_stand_in_one_of_several_tables(tmp_path):

@@ -197,8 +197,7 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     noise = {"speed_std": 0.1 + 0 * T, "yaw_rate_std": 0.001 + 0 * T}
     gyro = {"speed": speed, "yaw_rate": RATE + rng.normal(0, 0.001, len(T)), **noise}
     known = error(log(tmp_path / "known", "car", 1.0, 10, speed=speed, heading=COURSE)[0], co.Kalman())
-    read = log(tmp_path / "gyro", "car", 1.0, 10, **gyro)[0]
-    assert error(read, co.Kalman()) < 1.5 * known
+    assert error(log(tmp_path / "gyro", "car", 1.0, 10, **gyro)[0], co.Kalman()) < 1.5 * known
     spun = gyro | {"speed": speed + 8.0 * ((T > 80) & (T < 110))}
     notes = co.Kalman()(log(tmp_path / "spun", "car", 1.0, 10, **spun)[0].recording).notes
     assert any(note.startswith("odometry, a: fails") for note in notes)
@@ -300,8 +299,7 @@ def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     known = np.flatnonzero(np.isfinite(rec.gnss[0, :, 0, 0]))
     assert len(known) == len(t)
     for method in FILTERS:
-        far = norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)
-        assert (far[4:] < 2.6).all()
+        assert (norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)[4:] < 2.6).all()
 
 
 NONE = {

@@ -124,8 +124,7 @@ def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(folder, mon
             dx, dy, dz = np.diff(solve(each, backend).x, axis=0)[0]
             assert np.arctan2(dz, np.hypot(dx, dy)) == pytest.approx(angle, abs=near)
         source = folder / "lidar.py"
-        edited = source.read_text().replace("m.atan2(dz,", "m.atan2(-dz,")
-        source.write_text(edited)
+        source.write_text(source.read_text().replace("m.atan2(dz,", "m.atan2(-dz,"))
         dz = np.diff(solve(problem.add("lidar.py:elevation", AB, 0.2, std=0.01)).x, axis=0)[0, 2]
         assert dz < 0  # both rows have the formula of the edited file
         with refused(r"is no measurement.*@measurement"):

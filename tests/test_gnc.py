@@ -63,8 +63,7 @@ def test_a_group_is_one_hypothesis():
     """Five fixes 3 std off: 9 is within the 11.3 of one, 45 is not within the 30.6 of five (chi-square, 99 %)."""
     z = np.outer(np.arange(14) >= 9, [3.0, 0, 0])
     problem = Problem("a").add("position", ["a"] * 4, z[:4], std=0.05).add("position", ["a"] * 10, z[4:], std=1.0)
-    alone = solve_gnc(problem, [1])
-    assert (alone.extras["weights"] == 1).all()
+    assert (solve_gnc(problem, [1]).extras["weights"] == 1).all()
     together = solve_gnc(problem, [1], groups=["honest"] * 5 + ["spoofed"] * 5)
     assert together.extras["weights"].tolist() == [1.0] * 5 + [0.0] * 5
     assert together.x[0] == pytest.approx([0, 0, 0], abs=1e-9)

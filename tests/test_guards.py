@@ -42,8 +42,7 @@ def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table():
     assert track.notes[0].startswith("fixes, a: far from its estimates; ")
     assert not far_off(Kalman()(recording).x, recording, [0]).any()
     assert Kalman()(recording).notes == ()
-    columns = scored(blind, fast, FLEET.ids, FLEET)
-    assert columns["left_fixes"].tolist() == [[1.0]] * 3
+    assert scored(blind, fast, FLEET.ids, FLEET)["left_fixes"].tolist() == [[1.0]] * 3
 
     class Results:
         def select(self, where):

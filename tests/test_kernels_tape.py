@@ -17,8 +17,7 @@ UNARY = [one.name for one in Operation if one > Operation.ASSIGN and one.name no
 @pytest.mark.parametrize("name", [*UNARY, *sorted(BINARY)])
 def test_an_operation_is_casadis(name):
     """For numbers of both signs, equal ones and zeros, in more measurements than stand side by side."""
-    rng = np.random.default_rng(1)
-    a, b = rng.uniform(-2, 2, (2, 75))
+    a, b = np.random.default_rng(1).uniform(-2, 2, (2, 75))
     a[:5], b[:3], b[20:25] = 0.0, 0.0, a[20:25]
     x, y, number = ca.SX.sym("x"), ca.SX.sym("y"), getattr(ca, f"OP_{name}")
     made = ca.SX.binary(number, x, y) if name in BINARY else ca.SX.unary(number, x)

@@ -92,5 +92,4 @@ def test_import_is_light():
     """`import coopoc` and the core nouns load none of the heavy libraries."""
     heavy = {"numba", "torch", "cvxpy", "gtsam", "casadi", "osqp", "pandas", "matplotlib", "sklearn"}
     code = "import sys, coopoc; coopoc.Fleet, coopoc.observe; print(*sys.modules)"
-    loaded = python("-c", code).split()
-    assert not heavy & set(loaded)
+    assert not heavy & set(python("-c", code).split())

@@ -74,8 +74,7 @@ def test_tanh_and_sigmoid_against_numpy():
         exact = x.astype(float)
         assert_allclose(out[0], np.tanh(exact), rtol=tolerance)
         assert_allclose(out[1], 0.5 + 0.5 * np.tanh(0.5 * exact), atol=tolerance)
-    nothing = np.full(1, np.nan)
-    both(nothing, out := np.empty((2, 1)))
+    both(np.full(1, np.nan), out := np.empty((2, 1)))
     assert np.isnan(out).all()
 
 

@@ -236,8 +236,7 @@ def answers(clients: int = 7, size: int = 40, seed: int = 0) -> Tensor:
 
 def combined(which: Rule, weights: Tensor, sizes: Tensor = SIZES) -> Tensor:
     """What a rule makes of one round from zero."""
-    theta = torch.zeros_like(weights[0])
-    return which(theta, weights, sizes)
+    return which(torch.zeros_like(weights[0]), weights, sizes)
 
 
 @pytest.fixture(scope="module")

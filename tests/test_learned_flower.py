@@ -263,8 +263,7 @@ def test_the_text_of_an_error_stays_in_the_client(tmp_path, capsys):
     """A faulty drive raises an error that quotes a coordinate: it is in the client's log and not in its answer."""
     from flwr.app import ConfigRecord, Context, Message, RecordDict
 
-    fleet = drives(1)
-    write_table(fleet, tmp_path / "drive.csv")
+    write_table(drives(1), tmp_path / "drive.csv")
     lines = (tmp_path / "drive.csv").read_text().splitlines()
     lines[7] = lines[7].rpartition(",")[0] + ",8361947.125x"
     (tmp_path / "drive.csv").write_text("\n".join(lines))

@@ -125,8 +125,7 @@ def test_a_recipe_names_what_is_wrong_in_its_drives(monkeypatch):
     plain, text = recipes.RECIPES["fedkalmannet"], "fixes=0.2:1+outages=0.3:1"
     monkeypatch.setitem(recipes.RECIPES, "fedkalmannet", replace(plain, noise=text, piece=10))
     (job,) = recipes.jobs_of("fedkalmannet", recipes.Setting(), drives())
-    sensors = recipes.sensors(job)
-    assert sensors == replace(Sensors.paper_training(), outliers=Outliers.named(text))
+    assert recipes.sensors(job) == replace(Sensors.paper_training(), outliers=Outliers.named(text))
     pieces = [part for client in recipes.job_clients(job, drives()) for part in (client.training, client.validation)]
     fixes = [part.gnss.reshape(-1, 11, 3) for part in pieces]
     assert not any(bool(torch.isnan(fix[:, 0]).any()) for fix in fixes)

@@ -46,8 +46,7 @@ def test_the_error_names_field_value_and_allowed(parts, words):
 
 def program(*given: str, **env: str) -> str:
     """What tests/corrupted.py complains about, in a process that may crash."""
-    command = [sys.executable, str(Path(corrupted.__file__)), *given]
-    done = ran(command, env={**os.environ, **env})
+    done = ran([sys.executable, str(Path(corrupted.__file__)), *given], env={**os.environ, **env})
     assert done.returncode in (0, 1), f"{given}: ended by signal {-done.returncode}\n{done.stderr[-2000:]}"
     return done.stdout
 
@@ -61,8 +60,7 @@ def test_every_method_reads_any_memory_layout_and_survives_odd_recordings():
 def test_what_is_held_cannot_be_written_to():
     valid = corrupted.recording()
     given = {name: np.array(array) for name, array in corrupted.arrays(valid).items()}
-    held = corrupted.with_parts(valid, **given)
-    for name, array in corrupted.arrays(held).items():
+    for name, array in corrupted.arrays(corrupted.with_parts(valid, **given)).items():
         given[name][...] = 0
         np.testing.assert_array_equal(array, corrupted.arrays(valid)[name])
         assert array.flags.c_contiguous

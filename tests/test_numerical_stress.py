@@ -101,8 +101,7 @@ def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_t
     track = co.JointFilter()(observed(fleet, sensors), [0])
     assert any("at least 0.015 m and rad" in note for note in track.notes)
     assert (eigvalsh(track.covariance) > 0.0).all()
-    usual = co.JointFilter()(observed(fleet, co.Sensors()), [0])
-    assert not usual.notes
+    assert not co.JointFilter()(observed(fleet, co.Sensors()), [0]).notes
 
 
 @pytest.mark.parametrize("damage", [np.diag([1.0, -1e-6, 1.0]), np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1))])

@@ -66,8 +66,7 @@ def test_a_neighbour_whose_wheels_spin_costs_the_joint_filter_little():
     """Healthy egos erred by 1.18 m, not 0.58: their filters now know the variance of a corrected neighbour, too."""
     seen, truth = drive(10, 1.5, most=3)
     velocity = seen.velocity.copy()
-    others = np.setdiff1d(np.arange(len(seen.ids)), EGOS)[::2]
-    velocity[:, BEGINS:, others] *= 2.0
+    velocity[:, BEGINS:, np.setdiff1d(np.arange(len(seen.ids)), EGOS)[::2]] *= 2.0
     errors = [
         np.sqrt(np.square(JointFilter()(one, EGOS).x - truth).sum(axis=-1).mean())
         for one in (seen, replace(seen, velocity=velocity))

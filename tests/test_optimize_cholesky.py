@@ -76,8 +76,7 @@ def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():
     n = 20
     parent, begin, rows = np.arange(1, n + 1), np.r_[np.arange(n), n - 1], np.arange(1, n)
     parent[-1] = -1
-    found = supernodes(parent, begin, rows, np.ones(n, int))
-    assert found.tolist() == [0, 5, 10, 15, 20]
+    assert supernodes(parent, begin, rows, np.ones(n, int)).tolist() == [0, 5, 10, 15, 20]
 
 
 def test_small_matrices_are_factored_by_one_thread(monkeypatch):

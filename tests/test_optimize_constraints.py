@@ -116,8 +116,7 @@ def test_constraints_that_do_not_push_change_nothing(dense, length, backend):
     free = solve(problem)
     wide = problem.constrain("position", problem.names, free.x - 1.0, free.x + 0.1)
     wide = wide.constrain("displacement", (0, 1), -1e3, 1e3)
-    solution = solved(wide, backend)
-    same_minimum(solution, free)
+    same_minimum(solved(wide, backend), free)
 
 
 def drive(seed: int, vehicles: int = 2, steps: int = 4) -> Problem:

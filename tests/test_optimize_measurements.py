@@ -78,8 +78,7 @@ def errors(known: Measurement, rotations: Any, z: Any) -> Any:
 
 def test_a_relative_pose_is_scipys_logarithm():
     known, space = MEASUREMENTS["relative_pose"], Space(3, has_rotation=True)
-    z = space.join(VECTORS[::-1], ROTATIONS[::-1])
-    found = errors(known, ROTATIONS, z)
+    found = errors(known, ROTATIONS, space.join(VECTORS[::-1], ROTATIONS[::-1]))
     back = Rotation.from_matrix(ROTATIONS[::-1]).inv()
     assert found[:, :3] == pytest.approx(back.apply(VECTORS - VECTORS[::-1]), abs=1e-12)
     assert found[:, 3:] == pytest.approx((back * Rotation.from_matrix(ROTATIONS)).as_rotvec(), abs=1e-9)

@@ -230,8 +230,7 @@ def incomplete():
     gnss, relative = seen.gnss.copy(), seen.relative.copy()
     gnss[rng.random(gnss.shape[:3]) < 0.5] = nan
     for part, share in ((slice(None), 0.1), (1, 0.1), (slice(1, 3), 0.1), (0, 0.05)):
-        lost = rng.random(relative.shape[:2]) < share
-        relative[..., part][lost] = nan
+        relative[..., part][rng.random(relative.shape[:2]) < share] = nan
     return replace(seen, gnss=gnss, relative=relative)
 
 
@@ -274,5 +273,4 @@ def test_a_point_among_poses_has_no_rotation_to_move(poses):
     x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
     problem = Problem("abc", x0=x0, dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)
-    free = problem.movable
-    assert free.sum(axis=1).tolist() == wanted.tolist()
+    assert problem.movable.sum(axis=1).tolist() == wanted.tolist()

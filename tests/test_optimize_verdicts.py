@@ -51,8 +51,7 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     h, x = 1e-3 * np.eye(2), found.x[3]
     hessian = [[cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b) for a in h] for b in h]
     singular = "J^T J is singular here: the covariance is that of the exact Hessian" in found.notes
-    across = np.array([-along[1], along[0]])
-    assert singular == (abs((x - truth) @ across) < 1e-4)
+    assert singular == (abs((x - truth) @ np.array([-along[1], along[0]])) < 1e-4)
     if singular:
         assert found.covariance[3] == pytest.approx(inv(np.array(hessian) / 4e-6), rel=1e-3)
 

@@ -54,8 +54,7 @@ def test_only_the_job_that_publishes_may_ask_for_a_token():
 
 
 def test_every_package_that_is_installed_is_pinned():
-    needed = [Requirement(text).name for text in PROJECT["dependencies"]]
-    missing = closure(needed) - set(pins())
+    missing = closure([Requirement(text).name for text in PROJECT["dependencies"]]) - set(pins())
     assert missing == set()
     assert {"pip", "uv", "setuptools", "wheel"} <= set(pins())
     assert (ROOT / "Makefile").read_text().count("\t$(PIP) pip\n") == 1

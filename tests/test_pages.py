@@ -58,8 +58,7 @@ def close(shown: str, found: str) -> bool:
 @pytest.mark.parametrize("page", HERE)
 def test_the_python_of_a_page_prints_what_the_page_shows(page, tmp_path):
     shown = "".join(output for _, output in blocks(page)).splitlines()
-    found = printed(page, tmp_path).splitlines()
-    pairs = list(zip_longest(shown, found, fillvalue=""))
+    pairs = list(zip_longest(shown, printed(page, tmp_path).splitlines(), fillvalue=""))
     assert [(a, b) for a, b in pairs if not agree(a, b)] == []
 
 

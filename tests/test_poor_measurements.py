@@ -65,8 +65,7 @@ def ranged() -> tuple[Fleet, Recording]:
     t = 0.5 * np.arange(200)
     ego = np.stack([8 * t, 3 * np.sin(0.05 * t), 0 * t], axis=-1)
     around = np.stack([25 * np.cos(0.03 * t), 4 + 20 * np.sin(0.03 * t), 0 * t], axis=-1)
-    behind = np.stack([8 * t - 15, 0 * t - 12, 0 * t], axis=-1)
-    x = np.stack([ego, ego + around, behind], axis=1)
+    x = np.stack([ego, ego + around, np.stack([8 * t - 15, 0 * t - 12, 0 * t], axis=-1)], axis=1)
     velocity = np.diff(x, axis=0, prepend=x[:1]) / 0.5
     velocity[0] = velocity[1]
     fleet = Fleet(("ego", "around", "behind"), t, x, velocity)
@@ -89,8 +88,7 @@ def test_a_range_to_a_neighbour_whose_first_fix_comes_late_does_no_harm(method):
     track = method(seen, ["ego"])
     assert rt_le(track, fleet).mean() < min(1.1 * bound, 0.9 * rt_le(Kalman()(seen, ["ego"]), fleet).mean())
     assert track.covariance is not None
-    band = nees(track, fleet)[:, 10:].mean()
-    assert 2.0 < band < 4.5
+    assert 2.0 < nees(track, fleet)[:, 10:].mean() < 4.5
 
 
 NOISE = Sensors(heading_std=0.05)

@@ -147,8 +147,7 @@ def test_a_stream_gives_the_numbers_of_its_track(rough, how):
 
 
 def test_a_known_start_needs_no_compass():
-    sensors = co.Sensors(heading_std=0.05)
-    method = co.PoseFilter("solo", assumed=sensors)
+    method = co.PoseFilter("solo", assumed=co.Sensors(heading_std=0.05))
     still = co.OwnMeasurement([1.0, 0.0, 0.0], 0.0)
     stream = method.start(0.1, [1.0, 2.0, 0.0, 0.5])
     assert stream.step(still).x == pytest.approx([1.0, 2.0, 0.0, 0.5])

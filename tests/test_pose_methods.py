@@ -44,8 +44,7 @@ def observed(fleet: co.Fleet, sensors: co.Sensors = WHITE, runs: int = 30, **mor
 def test_white_noise_stays_inside_the_band(unit, masts, fix):
     """Chi-square of 3 degrees of freedom, run-averaged, on at least 95 % of the steps."""
     fleet, noise = convoy(masts=masts), replace(WHITE, velocity_reading="speed", gnss_std=(fix,) * 3)
-    track = co.PoseFilter(unit)(observed(fleet, noise), ["v1", "v2"])
-    found = co.pose_nees(track, fleet)
+    found = co.pose_nees(co.PoseFilter(unit)(observed(fleet, noise), ["v1", "v2"]), fleet)
     assert share_of_average(found.mean(axis=0), 30).min() >= 0.95
     low, high = nees_band(30 * 20)  # about as many independent values as there are runs and correlation times
     assert low < found.mean() < high

@@ -43,8 +43,7 @@ def test_the_token_bucket_by_hand():
 
 def test_messages_pass_the_bucket_nearest_first(crossing):
     """Against the rules, a message at a time."""
-    channel = V2X(4, loss=0.3, latency=0.1, bytes_per_second=500.0)
-    seen = observe(crossing, S2, channel, runs=5)
+    seen = observe(crossing, S2, V2X(4, loss=0.3, latency=0.1, bytes_per_second=500.0), runs=5)
     link = seen.links.of(0)
     size, start = 47, np.searchsorted(seen.links.step[link], np.arange(len(seen.t) + 1))
     given = (seen.arrival[:, link], size, start, seen.links.neighbour[link], seen)

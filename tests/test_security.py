@@ -78,8 +78,7 @@ def test_weights_run_no_code_that_their_card_names(evil, tmp_path):
     from coopoc.learned.checkpoint import load, write
 
     path, mark = evil
-    card = {"kind": f"{path}:Net", "net": {}}
-    write(tmp_path / "net.safetensors", {"w": torch.zeros(1)}, card)
+    write(tmp_path / "net.safetensors", {"w": torch.zeros(1)}, {"kind": f"{path}:Net", "net": {}})
     with refused(r"whose code does not run unless you name it.*load\(.*net="):
         load(tmp_path / "net.safetensors")
     assert not mark.exists()
@@ -207,8 +206,7 @@ def test_no_text_of_a_csv_is_a_formula():
 
 
 def test_no_text_of_a_csv_starts_a_row_or_reaches_the_terminal():
-    text = Table(("a\x1b[31m", "b"), (("x\r=1+1", 1),), "").to_csv()
-    assert text == "a [31m,b\nx =1+1,1\n"
+    assert Table(("a\x1b[31m", "b"), (("x\r=1+1", 1),), "").to_csv() == "a [31m,b\nx =1+1,1\n"
 
 
 def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row():

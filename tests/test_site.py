@@ -95,5 +95,4 @@ try:
 except pages.PluginError:
     print("refused")
 """
-    out = python("-c", code, cwd=ROOT / "docs")
-    assert out.split() == ["1", "refused"]
+    assert python("-c", code, cwd=ROOT / "docs").split() == ["1", "refused"]

@@ -40,8 +40,7 @@ def test_intervals_hold_the_mean_as_often_as_they_promise(egos, runs, between, l
     rng = default_rng(4)
     hits = 0
     for _ in range(300):
-        values = between * rng.normal(size=egos) + rng.normal(size=(runs, egos))
-        found = mean_interval(values)
+        found = mean_interval(between * rng.normal(size=egos) + rng.normal(size=(runs, egos)))
         hits += found.low <= 0 <= found.high
     assert low < hits / 300 < 0.98
 

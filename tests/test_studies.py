@@ -199,8 +199,7 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10):
     ],
 )
 def test_mistakes_end_with_a_sentence_and_status_2(arguments, words, tmp_path):
-    command = [str(Path(sys.executable).with_name("coopoc")), *arguments.split()]
-    done = ran(command, cwd=tmp_path)
+    done = ran([str(Path(sys.executable).with_name("coopoc")), *arguments.split()], cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
     assert "Traceback" not in done.stderr

@@ -109,8 +109,7 @@ def test_a_cell_is_the_federation_of_its_seed():
 def test_the_study_runs_and_says_what_it_found(tmp_path):
     wanted = {**TINY, "runs": 1, "method": "mean,centralised,kalman,bound", "condition": "iid,poisoned update"}
     study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
-    results = run_study(study, out=tmp_path)
-    assert results.failed == 0
+    assert run_study(study, out=tmp_path).failed == 0
     shown = published(tmp_path / "aggregation")
     assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]
     assert "equal sensors, equal amounts of data" in shown["tables"][0]["caption"]

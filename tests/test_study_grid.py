@@ -193,8 +193,7 @@ def test_a_caption_or_a_views_name_recomputes_nothing(tmp_path):
     for number, caption, name, finished in ((2, "One", "a", 0), (2, "Two", "b", 2), (3, "Two", "b", 0)):
         file.write_text(FILE.format(number=number, caption=caption, name=name))
         assert plan(study, out)["finished"] == finished
-        results = run_study(study, out)
-        assert results.frame["y"].tolist() == [number, 2 * number]
+        assert run_study(study, out).frame["y"].tolist() == [number, 2 * number]
         assert [path.stem for path in (out / "own" / "tables").glob("*.md")] == [name]
         assert caption in (out / "own" / "tables" / f"{name}.md").read_text()
 

@@ -37,8 +37,7 @@ def frame():
 def test_means_are_those_of_pandas(frame):
     by = ["method", "noise_model", "k"]
     summary = results(frame).summary(by, "rt_le_m").set_index(by)["mean"]
-    expected = frame.groupby(by)["rt_le_m"].mean()
-    for name, value in expected.items():
+    for name, value in frame.groupby(by)["rt_le_m"].mean().items():
         assert summary[name] == pytest.approx(value)
     assert list(dict.fromkeys(summary.index.get_level_values("method"))) == ["gnss", "kalman", "bound"]
 

@@ -231,8 +231,7 @@ def test_a_file_is_written_whole_or_not_at_all(name, tmp_path, monkeypatch):
 
 
 def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study, tmp_path):
-    more = replace(study, tables={**study.tables, "extra": study.tables["rt_le"]})
-    run_study(more, tmp_path)
+    run_study(replace(study, tables={**study.tables, "extra": study.tables["rt_le"]}), tmp_path)
     (tmp_path / "small/tables/mine.md").write_text("by hand")
     assert len(list((tmp_path / "small/tables").glob("extra.*"))) == 4
     run_study(study, tmp_path)

@@ -122,8 +122,7 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
 def test_zero_noise_may_act_but_not_be_assumed(crossing):
     with refused(r"gnss_std.*assumed=Sensors"):
         observe(crossing, SILENT)
-    recording = observe(crossing, SILENT, assumed=S2)
-    assert np.array_equal(recording.gnss[0], crossing.position)
+    assert np.array_equal(observe(crossing, SILENT, assumed=S2).gnss[0], crossing.position)
 
 
 def test_draws_belong_to_their_key(crossing):

@@ -59,8 +59,7 @@ def test_every_block_of_python_runs(folder):
     assert "not used" not in out
     assert "read: 180 fixes, 2700 ranges" in out
     assert "29.54 m\n30.0 m" in out
-    error = float(re.findall(r"\[\[([\d.]+)\]\]", out)[0])
-    assert error < 1.0
+    assert float(re.findall(r"\[\[([\d.]+)\]\]", out)[0]) < 1.0
 
 
 def test_every_kind_is_on_the_page():

@@ -186,8 +186,7 @@ def _bound(
     runs = [None] if recording is None else _measured(fleet, links, np.unique(np.concatenate(members)), recording)
     total = np.zeros(())
     for run in runs:
-        stages = position_stages(fleet, sensors, links, members, run)
-        total = total + _marginals(fleet, stages, smoothing)[..., :3, :3]
+        total = total + _marginals(fleet, position_stages(fleet, sensors, links, members, run), smoothing)[..., :3, :3]
     return total / len(runs)
 
 
@@ -219,8 +218,7 @@ def _marginals(fleet: Fleet, stages: "list[Stage]", smoothing: bool) -> Floats:
     out = np.full((*fleet.position.shape[:2], d, d), np.nan)
     for t, cov in covariances(stages, smoothing):
         n, members = len(stages[t].members), stages[t].members
-        blocks = cov.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
-        out[t, members[members < vehicles]] = blocks[members < vehicles]
+        out[t, members[members < vehicles]] = cov.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)][members < vehicles]
     return out
 
 
@@ -319,8 +317,7 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
     motion, noise = np.zeros((*shape, d, d)), np.zeros((*shape, d, d))
     motion[...] = np.eye(d)
     motion[..., :3, 3] = aside
-    std = sensors.velocity_std(forward)
-    noise[..., :3, :3] = dt * turned(std[..., None] * np.eye(3), heading[..., None]).mT
+    noise[..., :3, :3] = dt * turned(sensors.velocity_std(forward)[..., None] * np.eye(3), heading[..., None]).mT
     noise[..., :3, 3], noise[..., 3, 3] = 0.5 * dt * sensors.yaw_rate_std * aside, dt * sensors.yaw_rate_std
     keep = float(np.exp(-dt / sensors.odometry_error_time))
     for column, kind in enumerate(lasting, 4):

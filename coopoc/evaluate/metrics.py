@@ -122,8 +122,7 @@ def share_of_average(average: Floats, runs: int) -> Floats:
     array([0.5])
     """
     low, high = nees_band(runs)
-    inside = np.where(np.isnan(average), nan, (average >= low) & (average <= high))
-    return np.asarray(np.nanmean(inside, axis=0))
+    return np.asarray(np.nanmean(np.where(np.isnan(average), nan, (average >= low) & (average <= high)), axis=0))
 
 
 def heading_error(track: Track, fleet: Fleet) -> Floats:
@@ -158,8 +157,7 @@ def pose_nees(track: Track, fleet: Fleet) -> Floats:
     """
     turn = heading_error(track, fleet)
     error = np.concatenate([(track.x - _truth(track, fleet))[..., :2], turn[..., None]], axis=-1)
-    solved = solve(pose_covariance(track), error[..., None])[..., 0]
-    return np.asarray((error * solved).sum(axis=-1))
+    return np.asarray((error * solve(pose_covariance(track), error[..., None])[..., 0]).sum(axis=-1))
 
 
 def pose_covariance(track: Track) -> Floats:
@@ -244,8 +242,7 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     innovation = fix_innovations(track, recording)
     u, angle = recording.velocity[:, 1:, egos], _halfway(track, recording)
     axes = turned(np.eye(3), angle[..., None])  # rows: the axes of sigma_u
-    std = noise.motion_std(recording.velocity[:, :, egos], recording.dt)[:, 1:]
-    moving = np.nan_to_num(std)[..., None] * axes
+    moving = np.nan_to_num(noise.motion_std(recording.velocity[:, :, egos], recording.dt)[:, 1:])[..., None] * axes
     covariance = track.covariance[:, :-1] + np.einsum("...ki,...kj->...ij", moving, moving)
     fixes = np.square(noise.fix_std * recording.fix_scale[1:, egos])
     covariance[..., range(3), range(3)] += fixes + recording.motion_extra[1:, egos]
@@ -255,8 +252,7 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
         half = (shared + 0.5 * variance * aside)[..., None] * aside[..., None, :]
         covariance += half + half.mT
     squares, d = np.full(innovation.shape[:3], nan), innovation[:, 1:]
-    square = np.einsum("...i,...i->...", d, solve(covariance, d[..., None])[..., 0])
-    squares[:, 1:] = square / dimensions(recording)
+    squares[:, 1:] = np.einsum("...i,...i->...", d, solve(covariance, d[..., None])[..., 0]) / dimensions(recording)
     _require_sound(track, track.covariance, squares, "the method")
     return squares
 

@@ -80,8 +80,7 @@ def plot_track(
     """
     last = len(instance("track", track, Track).x) - 1
     run = number("run", run, 0, last, kind=int, allowed=f"in 0..{last}")
-    fair = max(len(track.t) // 40, 1)
-    every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
+    every = number("every", max(len(track.t) // 40, 1) if every is None else every, 1, kind=int, allowed=">= 1 step")
     if fleet is not None:
         same_drive(instance("fleet", fleet, Fleet), (track.ids or fleet.ids)[: len(fleet.ids)], track.t)
     ax, few = axes(ax), len(track.egos) <= len(COLORS)
@@ -196,8 +195,7 @@ def ellipses(ax: "Axes", center: Floats, covariance: Floats, color: str, label: 
     """
     from matplotlib.patches import Ellipse
 
-    fine = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(center).all(axis=1)
-    for k in np.flatnonzero(fine).tolist():
+    for k in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(center).all(axis=1)).tolist():
         values, axis = np.linalg.eigh(covariance[k])
         width, height = 2.0 * np.sqrt(SHARE_95 * np.maximum(values, 0.0))
         angle = float(np.degrees(np.arctan2(axis[1, 0], axis[0, 0])))

@@ -229,8 +229,7 @@ def shapes(field: str, dimension: int, rows: int) -> dict[str, tuple[int, ...]]:
     if "point" in field:
         return {**common, "position": (rows, dimension), "covariance": (rows, dimension, dimension)}
     turn, size = (1, 3) if dimension == 2 else (4, 6)
-    poses = {"position": (rows, dimension), "orientation": (rows, turn), "covariance": (rows, size, size)}
-    return {**common, **poses}
+    return {**common, **{"position": (rows, dimension), "orientation": (rows, turn), "covariance": (rows, size, size)}}
 
 
 def check(graph: Graph, location: Location) -> None:

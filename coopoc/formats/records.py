@@ -151,8 +151,7 @@ class Grammar:
         notes = list[str]() if repair else None
         edges: dict[str, Any] = {kind: self._edges(file, rows[kind], index, notes) for kind in ENDS if kind in rows}
         still = [_find(location("fixed", row), word, "any", index) for row, (_, word) in enumerate(fixed)]
-        fixed_at = np.array(still, int)
-        return replace(vertices, **edges, fixed=fixed_at, notes=tuple(notes or ()), location=location)
+        return replace(vertices, **edges, fixed=np.array(still, int), notes=tuple(notes or ()), location=location)
 
     def _collect(self, file: str, lines: Iterable[tuple[int, list[str]]]) -> tuple[int, dict[str, _Rows]]:
         """Dimension of a file, and its lines by kind."""

@@ -172,8 +172,7 @@ def inverse(matrices: Floats, location: Callable[[int], str], repairs: list[str]
     scale = np.exp2(np.rint(-0.5 * np.log2(np.where(positive, diagonal, 1))))
     both = scale[:, :, None] * scale[:, None, :]
     scaled = matrices * both
-    bad = np.flatnonzero(~positive.all(axis=-1) | (eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1))
-    for row in bad.tolist():
+    for row in np.flatnonzero(~positive.all(axis=-1) | (eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1)).tolist():
         own, axes = eigh(scaled[row])
         if repairs is None or not own[-1] > 0:
             raise InputError(

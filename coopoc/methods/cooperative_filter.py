@@ -207,8 +207,7 @@ class CooperativeFilter(Checked):
         priors = priors_of(self, noise_model, recording.measured)
         velocity = recording.velocity
         if priors.fix_gate:
-            columns = recording.observing(egos)
-            recording, noise_model = with_odometry(recording, columns, noise_model, priors.fix)
+            recording, noise_model = with_odometry(recording, recording.observing(egos), noise_model, priors.fix)
         extra, noise_model = noise_model.extra, replace(noise_model, extra=None)
         model, notes = model_of(noise_model, priors), [*noise_model.notes]
         variance = priors.fix**2 * noise_model.fix_variance(recording)

@@ -68,8 +68,7 @@ def follow_egos(
                     extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(result.step, int) else len(recording.t[result.step]))
     absent = np.logical_and.accumulate(np.isnan(x[..., 0]).any(axis=0))  # a later NaN is an error
-    stated = getattr(method, "noise_model", "nominal")
-    notes = (*notes, *doubts(recording, columns, x, cov, stated, neighbours, notes))
+    notes = (*notes, *doubts(recording, columns, x, cov, getattr(method, "noise_model", "nominal"), neighbours, notes))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = clock() - began

@@ -38,8 +38,7 @@ class GNSS(Alone):
         columns = check_recording(recording).columns(egos)
         fixes = recording.gnss[:, :, columns]
         there = np.isfinite(fixes).all(axis=-1, keepdims=True)
-        newest = last_true(there, axis=1).clip(0)
-        x, missing = np.take_along_axis(fixes, newest, axis=1), 100 * (1 - there.mean())
+        x, missing = np.take_along_axis(fixes, last_true(there, axis=1).clip(0), axis=1), 100 * (1 - there.mean())
         notes = (f"holds the last fix where there is none: {missing:.0f} % of the steps",) if missing else ()
         variance = np.broadcast_to(np.square(recording.sensors.gnss_std * recording.fix_scale[:, columns]), x.shape)
         return solo_track(recording, columns, x, variance, began, notes)

@@ -37,8 +37,7 @@ def with_odometry(
         fix: factor of the standard deviation of fixes.
     """
     links = recording.links
-    columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    corrections = faults(recording, columns, noise_model, fix)
+    corrections = faults(recording, np.union1d(egos, links.neighbour[np.isin(links.observer, egos)]), noise_model, fix)
     if corrections is None:
         return recording, noise_model
     velocity, extra = recording.velocity.copy(), corrections[..., 2]
@@ -70,8 +69,7 @@ def faults(recording: Recording, columns: Ints, noise_model: NoiseModel, fix: fl
     columns = columns[~np.isin(columns, recording.landmarks) & ~((more[0] > 0.0) & (np.ptp(more, axis=0) == 0.0))]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh = new_state(motion_noise(noise_model, recording.dt))
-    variance = recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance)
-    drives = gnss, velocity, fresh, variance, columns, recording.dt
+    drives = gnss, velocity, fresh, recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance), columns, recording.dt
     if not correct_drives(*drives, np.empty((0, 0, 0, 3))):
         return None
     corrections = np.zeros(velocity.shape)

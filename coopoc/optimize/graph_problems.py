@@ -230,5 +230,4 @@ def _fixed(graph: Graph) -> tuple[int, ...]:
     part = parts(len(graph.names), *(each.nodes for each in edges))
     held = np.concatenate([graph.fixed, graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])
     loose = np.flatnonzero(graph.is_pose & ~np.isin(part, part[held]))
-    first = loose[np.unique(part[loose], return_index=True)[1]]
-    return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())
+    return tuple(np.sort(np.concatenate([graph.fixed, loose[np.unique(part[loose], return_index=True)[1]]])).tolist())

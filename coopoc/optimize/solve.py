@@ -306,8 +306,7 @@ def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) ->
     if status is Status.SOLVED:
         return
     pairs = stacked((f.nodes for f in problem.factors if f.nodes.shape[1] == 2), 2)
-    gap = norm(np.diff(at[pairs][..., :2], axis=1), axis=(1, 2))
-    for i, j in pairs[gap < COINCIDENT * extent][:1]:
+    for i, j in pairs[norm(np.diff(at[pairs][..., :2], axis=1), axis=(1, 2)) < COINCIDENT * extent][:1]:
         yield f"{names[i]} and {names[j]} nearly coincide, or differ in height alone: no direction has a derivative"
     if status is Status.FAILED:
         yield f"another step would move a node by {truth.remaining:.2g} m or rad and save {truth.predicted:.2g}"

@@ -179,16 +179,14 @@ def find_study(name: str) -> Study:
     if not in_file(name):
         installed: Study = find("coopoc.studies", name)
         return installed
-    hint = "Give STUDY = coopoc.Study(...) in the file."
-    study = instance(f"study {name!r}", from_file(name, "study"), Study, hint)
+    study = instance(f"study {name!r}", from_file(name, "study"), Study, "Give STUDY = coopoc.Study(...) in the file.")
     path, _, attribute = name.rpartition(":")
     code, own = code_of(study.cell), study.key
 
     def key(params: Params) -> Params:
         return {**own(params), "cell": code}
 
-    cell = _FileCell(f"{Path(path).resolve()}:{attribute}", file_digest(name, "study"))
-    return replace(study, cell=cell, key=key)
+    return replace(study, cell=_FileCell(f"{Path(path).resolve()}:{attribute}", file_digest(name, "study")), key=key)
 
 
 @dataclass(frozen=True)

@@ -261,8 +261,7 @@ def schedule(ids: Sequence[str], t: Floats, links: Links, v2x: V2X, runs: int, s
         limit = f"must be <= 1/dt = {1 / dt:g} Hz"
         raise InputError("rate", f"{v2x.rate} Hz", limit, "Broadcast at most once a step.")
     phase = np.array([stream(seed, "phase", 0, name).uniform() for name in ids])
-    count = np.floor((np.arange(-1, len(t))[:, None] + 1e-9) * per_step + phase)
-    sends = np.diff(count, axis=0) > 0
+    sends = np.diff(np.floor((np.arange(-1, len(t))[:, None] + 1e-9) * per_step + phase), axis=0) > 0
     sent = sends[links.step, links.neighbour]
     arrival = np.where(sent, links.step + int(np.ceil(v2x.latency / dt - 1e-9)), -1)[None].repeat(runs, axis=0)
     if v2x.loss > 0:
@@ -271,8 +270,7 @@ def schedule(ids: Sequence[str], t: Floats, links: Links, v2x: V2X, runs: int, s
             index = pair[sent[pair]]
             size = int(number[index].max(initial=-1)) + 1
             draws = np.stack([stream(seed, "loss", r, observer, neighbour).uniform(size=size) for r in range(runs)])
-            gone = lost(draws, v2x.loss, v2x.burst)[:, number[index]]
-            arrival[:, index] = np.where(gone, -1, arrival[:, index])
+            arrival[:, index] = np.where(lost(draws, v2x.loss, v2x.burst)[:, number[index]], -1, arrival[:, index])
     return sends, arrival
 
 

@@ -68,8 +68,7 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
         part = (t - last[(last - t).between(0.9 * period, 1.1 * period)].max()) / period + 1.0
         if part.between(-0.25, 1.25)[t.notna()].all() and not part.between(0.25, 0.75).any():
             summary.assume(f"stamps wrap around after {period:.10g} s: those of its first half come later")
-            early = {name: rows[name].mask(part < 0.5, rows[name] + period) for name in ("t", "arrival")}
-            return rows.assign(**early)
+            return rows.assign(**{name: rows[name].mask(part < 0.5, rows[name] + period) for name in ("t", "arrival")})
     if 0 < back.mean() < DISORDER_SHARE:
         summary.assume(
             f"stamps of {', '.join(rows['vehicle'][back].unique())} go back (first: {row_of(rows[back])}): was a clock "
@@ -124,8 +123,7 @@ def check_one_drive(rows: Rows, name: str) -> None:
     """InputError for files of measurements that are too far apart in time to be of one drive."""
     spans = rows[rows["true"] == 0].groupby("file", sort=False)["t"].agg(["min", "max"]).dropna().sort_values("min")
     gaps = spans["min"] - spans["max"].cummax().shift()
-    covered = spans["max"].max() - spans["min"].min() - gaps.clip(lower=0.0).sum()
-    if (gaps > max(DRIVES_APART, covered)).any():
+    if (gaps > max(DRIVES_APART, spans["max"].max() - spans["min"].min() - gaps.clip(lower=0.0).sum())).any():
         raise InputError(
             name,
             "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),

@@ -205,8 +205,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
             )
         by = f"by {f'the course of the {pointing.source}' if pointing.source else 'its heading'})"
         summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, {by}")
-        angle = pd.Series(pointing.at(fixes.t)).ffill().bfill().to_numpy()
-        fixes = Signal(fixes.t, fixes.value - turned(off, angle))
+        fixes = Signal(fixes.t, fixes.value - turned(off, pd.Series(pointing.at(fixes.t)).ffill().bfill().to_numpy()))
         way = way._replace(fixes=fixes)
         shown = velocity_of_fixes(way, steps)
         derived, factor = heading_of_rates(way, steps.gap(turn.t))
@@ -348,8 +347,7 @@ def _heading(
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
         fastest = abs(way.speed.value).max() if len(way.speed.t) else inf
-        least = min(MOVING, OF_FASTEST * fastest)
-        if (moving := (pace > np.maximum(least, SHOWN_STDS * unsure)) & certain).any():
+        if (moving := (pace > np.maximum(min(MOVING, OF_FASTEST * fastest), SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
             if len(way.speed.t):
                 course = wrap(course - np.arctan2(*between(way.speed, t)[:, 1::-1].T))

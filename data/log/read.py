@@ -243,8 +243,7 @@ def read_log(
     few = (2 * high < fixed) & (rows["kind"] == "z")
     summary.refuse("heights of vehicles with few", rows[few])
     rows = rows[~few]
-    grid = _grid(rows, dt, body, summary)
-    steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary, offset)
+    steps = Steps(_grid(rows, dt, body, summary), max_gap, not (rows["kind"] == "z").any(), body, summary, offset)
     arms, tags = (each if isinstance(each, Mapping) else dict.fromkeys(ids, each) for each in (antenna, tag))
     for option, each in (("antenna", arms), ("tag", tags)):
         columns_of(option, [*named(option, each, f"Give {option}={{name: (forward, left, up)}}.")], ids)

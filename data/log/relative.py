@@ -264,8 +264,7 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
         steps, lags = links.step[some][:, None], np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
         then = (steps - np.round(lags / world.dt).astype(int)).clip(0, len(c.x) - 1)
         places = np.hstack([c.x[steps[:, 0]], c.x[then, other]])  # of all, and of its own before and later
-        far = norm(places - c.x[steps, one], axis=2)
-        miss = pd.DataFrame(abs(far - measured[some, None])).median().fillna(inf)
+        miss = pd.DataFrame(abs(norm(places - c.x[steps, one], axis=2) - measured[some, None])).median().fillna(inf)
         best, ahead = int(miss.argmin()), nan
         if k == 0 and miss[best] < WIDE_RATIO * np.median(expected) < 0.2 * size:
             ahead = nan if best < len(ids) else float(lags[best - len(ids)])

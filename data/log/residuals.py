@@ -78,8 +78,7 @@ class Check:
 
     def shown(self, column: int) -> bool:
         """Whether a velocity is of the fixes, whenever they are."""
-        reading = self.world.sensors.velocity_reading
-        return reading == "fixes" or self.world.ids[column] in self.log.summary.shown
+        return self.world.sensors.velocity_reading == "fixes" or self.world.ids[column] in self.log.summary.shown
 
     @property
     def still(self) -> Bools:
@@ -144,8 +143,7 @@ def without_wild(c: Check) -> Check:
     size, rec = dimensions(c.world), c.log.recording
     square = pd.DataFrame(size * c.normalised)
     square[[*map(rec.ids.index, c.failing)]] = nan
-    usual = (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS)
-    wild = np.array(square > WILD_STDS**2 * usual)
+    wild = np.array(square > WILD_STDS**2 * (square.median() / scipy.stats.chi2.median(size)).clip(LEAST_NIS))
     for column in range(wild.shape[1]):  # where the next fix is off alike, the filter is
         at = np.flatnonzero(np.isfinite(c.fix[:, column, 0]))
         gap, off = plane(c.fix[at, column]), wild[at, column]

@@ -98,8 +98,7 @@ def rows_of(frame: pd.DataFrame, file: str) -> Rows:
     """Rows of a table with some of these columns; its index numbers them."""
     blank: dict[str, Any] = {name: value for name, value in BLANK.items() if name not in frame}
     rows = frame.assign(**blank, file=file, row=frame.index)[[*BLANK, "file", "row"]]
-    names = {name: object if value == "" else float for name, value in BLANK.items()}
-    return rows.astype(names).reset_index(drop=True)
+    return rows.astype({name: object if value == "" else float for name, value in BLANK.items()}).reset_index(drop=True)
 
 
 def of_kinds(frame: pd.DataFrame, file: str) -> Rows:
@@ -177,8 +176,7 @@ def _leaps(ranges: Rows, number: float) -> Bools:
         ranges["value"][some].groupby(pair).diff().abs()[lambda step: step > 0.0] for some in (same | True, ~same)
     )
     leaps = leaps[same | same.shift(fill_value=False)]
-    often = same.sum() >= LEAST_MEANT and leaps.median() > LEAST_MEANT * plain.quantile(0.8)
-    return (same & bool(often)).to_numpy()
+    return (same & bool(same.sum() >= LEAST_MEANT and leaps.median() > LEAST_MEANT * plain.quantile(0.8))).to_numpy()
 
 
 def check_values(rows: Rows) -> None:

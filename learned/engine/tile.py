@@ -72,8 +72,7 @@ def _emit(build: Any, shape: tuple[int, int], blocks: Any, across: Any, depth: A
     out, a, b, start = blocks
 
     def place(block: Any, row: Any, column: Any, kind: Any = vector) -> Any:
-        index = build.add(build.mul(row, block[1]), column)
-        return build.bitcast(build.gep(block[0], [index]), ir.PointerType(kind))
+        return build.bitcast(build.gep(block[0], [build.add(build.mul(row, block[1]), column)]), ir.PointerType(kind))
 
     def load(block: Any, row: Any, v: int) -> Any:
         return build.load(place(block, row, word(v * count)), align=4)

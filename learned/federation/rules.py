@@ -169,8 +169,7 @@ class Krum(Rule):
         exact, near = weights.double(), len(weights) - self.byzantine - 2
         square = torch.stack([(exact - one).square().sum(1) for one in exact])
         scores = square.fill_diagonal_(torch.inf).sort(1).values[:, :near].sum(1)
-        best = scores.argsort(stable=True)[: self.keep or len(weights) - self.byzantine]
-        return weights[best.sort().values].mean(0)
+        return weights[scores.argsort(stable=True)[: self.keep or len(weights) - self.byzantine].sort().values].mean(0)
 
 
 RULES = {

@@ -176,8 +176,7 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
         def aggregate_evaluate(self, server_round: int, replies: "Iterable[Message]") -> Any:
             answers, rejected, _ = read(replies, names, "validation-loss")
             losses, pieces = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
-            row = self.row._replace(validation_loss=losses, pieces=pieces, rejected=self.row.rejected | rejected)
-            keep(row)
+            keep(self.row._replace(validation_loss=losses, pieces=pieces, rejected=self.row.rejected | rejected))
             return super().aggregate_evaluate(server_round, list(answers.values()))
 
     return Screened()

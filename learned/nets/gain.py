@@ -125,8 +125,7 @@ class Recurrent(Gain):
         References:
             arXiv 2411.05847, equation 7.
         """
-        x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return squared_error(x, batch.truth)
+        return squared_error(self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt), batch.truth)
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""

@@ -133,8 +133,7 @@ class GainNet(Recurrent):
         x = x_prior + (matrix @ (fix - x_prior).unsqueeze(-1)).squeeze(-1)
         new = Memory(process, posterior, innovation, x, memory.x, x_prior, fix)
         held = memory._replace(x=x, x_before=memory.x)
-        after = Memory(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True)))
-        return after, matrix
+        return Memory(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True))), matrix
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (B, T, 3) m as in `Recurrent`; compiled where no gradient is wanted, in main memory."""

@@ -57,8 +57,7 @@ class Schedule:
             return np.stack([draw.permutation(pieces)[:batch] for _ in range(self.epochs)])
         steps = -(-self.epochs * pieces // batch)
         passes = -(-steps * batch // pieces)
-        order = np.concatenate([draw.permutation(pieces) for _ in range(passes)])
-        return order[: steps * batch].reshape(steps, batch)
+        return np.concatenate([draw.permutation(pieces) for _ in range(passes)])[: steps * batch].reshape(steps, batch)
 
 
 def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:

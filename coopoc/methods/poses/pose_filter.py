@@ -266,8 +266,7 @@ class PoseFilter:
         pairs = 1 + int(noise.longer * measured.ends[:, 2].max(initial=0))
         poses, pair = new_poses(len(members) * noise.d + pairs), new_poses(2 * noise.d + 1)
         first = np.ascontiguousarray(begin.reshape(len(begin), -1, *begin.shape[-2:])[:, :, members])
-        faults = new_faults(len(members), noise, recording.dt)
-        return run_filter(measured, noise, first, spread, poses, pair, faults)
+        return run_filter(measured, noise, first, spread, poses, pair, new_faults(len(members), noise, recording.dt))
 
     def _settings(self, sensors: Sensors, dt: float) -> "PoseNoise":
         """What it assumes, and its options, as the kernel takes them."""

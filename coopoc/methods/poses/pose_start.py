@@ -147,8 +147,7 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     compass = body.heading[0, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
-        to_tag = turned(recording.tags[column], turns)
-        return _of_ranges(recording, column, links, places, angles, way + to_tag)
+        return _of_ranges(recording, column, links, places, angles, way + turned(recording.tags[column], turns))
     if (
         not len(fixes)
         and np.isnan(body.heading[0, :, column]).all()
@@ -185,5 +184,4 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
     right = np.square(centres[..., :2]).sum(axis=-1) - recording.relative[0, links[rows], 0] ** 2
     matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
-    position = (pinv(matrix) @ right[..., None])[:, :2, 0]
-    return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
+    return np.column_stack([(pinv(matrix) @ right[..., None])[:, :2, 0], centres[..., 2].mean(axis=1), angles])

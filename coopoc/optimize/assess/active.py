@@ -146,8 +146,7 @@ def _directions(size: int, columns: list[Ints], blocks: list[Floats]) -> Any:
 
     own = stacked(columns)
     rest = np.setdiff1d(np.arange(size), own)
-    whole = block_diag([*blocks, eye_array(len(rest))], format="csr")
-    return whole[np.argsort(np.r_[own, rest])].tocsc()
+    return block_diag([*blocks, eye_array(len(rest))], format="csr")[np.argsort(np.r_[own, rest])].tocsc()
 
 
 def _words(problem: Problem, rows: Rows) -> str:

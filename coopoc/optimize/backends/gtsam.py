@@ -102,8 +102,7 @@ def _form(problem: Problem, factor: Factor) -> Form:
     parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
     if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
         return None
-    supported = all(row in part.names or row[::-1] in part.names for row in kinds for part in parts)
-    return parts if supported else None
+    return parts if all(row in part.names or row[::-1] in part.names for row in kinds for part in parts) else None
 
 
 def pose_of(d: int, x: Floats) -> Any:

@@ -173,8 +173,7 @@ def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     size = rows.matrix.shape[1]
 
     def least(weight: Floats, matrix: Any) -> Floats:
-        programme = Programme(diags(weight, format="csc"), csc_matrix(matrix))
-        return programme.solve(weight, 0.0 * weight, *rows.sides)[0]
+        return Programme(diags(weight, format="csc"), csc_matrix(matrix)).solve(weight, 0.0 * weight, *rows.sides)[0]
 
     try:
         step, feasible = least(np.ones(size), rows.matrix), True

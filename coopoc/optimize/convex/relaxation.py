@@ -203,8 +203,7 @@ def shor(problem: Problem) -> Relaxation:
     Y, d, space = vectors * np.sqrt(np.maximum(values, 0.0)), form.columns, problem.space
     _, values, rows = svd(Y, full_matrices=False)
     gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
-    top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
-    x = space.join(*form.drop(reduced.settle(form.project(top))))
+    x = space.join(*form.drop(reduced.settle(form.project(np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))))))
     solution = solve(replace(problem, x0=x), throw=False)
     X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
     # the refined point's own bound never exceeds Shor's but by what the solver lacks

@@ -185,8 +185,7 @@ def expressions(structure: Structure) -> dict[str, Any]:
             cost += 0.5 * robust(ca.sumsqr(white), term.kind.loss)
     for term in structure.constraints:
         numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
-        value = ca.vertcat(*each(term, numbers[-1]))
-        bounds.append(value[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
+        bounds.append(ca.vertcat(*each(term, numbers[-1]))[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
     f, g = ca.cse([ca.SX(cost), ca.vertcat(*bounds)])  # a node's turn is that of all its measurements
     return {"x": steps, "p": ca.veccat(centre, *numbers), "f": f, "g": g}
 
@@ -374,5 +373,4 @@ def _goal(kind: Kind, rows: int) -> Any:
     component, column = write(kind, "jacobian").entries.T
     node, direction = np.divmod(column, dof)
     first = np.where(column < 0, component, size * rows * (1 + node * dof) + component * dof + direction)
-    stride = np.where(column < 0, size, size * dof)
-    return (first[:, None] + stride[:, None] * np.arange(rows)).astype(np.int32)
+    return (first[:, None] + np.where(column < 0, size, size * dof)[:, None] * np.arange(rows)).astype(np.int32)

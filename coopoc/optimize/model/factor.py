@@ -139,8 +139,7 @@ def check_root(measurement: Measurement, root: ArrayLike, shape: tuple[int, int]
     if array.ndim != 3 or array.shape[1:] != (size, size) or len(array) not in (1, shape[0]):
         allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"
         raise InputError(f"sqrt_information of {measurement.name}", array.shape, allowed, "W with W^T W = cov^-1.")
-    hint = "Invert a positive definite covariance."
-    refuse("sqrt_information", array, ~np.isfinite(array), "must be finite", hint)
+    refuse("sqrt_information", array, ~np.isfinite(array), "must be finite", "Invert a positive definite covariance.")
     return frozen(array)
 
 

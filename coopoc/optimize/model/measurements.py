@@ -101,8 +101,7 @@ def embed(numbers: Sequence[Any], dimension: int) -> list[Any]:
     at = [*numbers[:d], *[0.0 * numbers[0]] * (3 - d)]  # of the namespace's own type
     if len(numbers) == d:
         return at
-    turned = [[numbers[d + d * i + j] if max(i, j) < d else float(i == j) for j in range(3)] for i in range(3)]
-    return [*at, turned]
+    return [*at, [[numbers[d + d * i + j] if max(i, j) < d else float(i == j) for j in range(3)] for i in range(3)]]
 
 
 MEASUREMENTS: dict[str, Measurement] = {}

@@ -108,8 +108,7 @@ def log(rotation: Floats) -> Floats:
         return to_orientation(rotation)
     from scipy.spatial.transform import Rotation
 
-    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
-    return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
+    return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()).reshape(*rotation.shape[:-2], 3)
 
 
 def nearest_rotation(matrix: Floats) -> Floats:

@@ -230,8 +230,7 @@ def contest(
         while cost(best_x) < (1.0 - GAINED) * least:
             least = cost(best_x)
             if len(loose):
-                again = graduate(marked, inner, best_x, first_mu(REGRADUATE_RATIO2))
-                best_x = min((best_x, landed(again.x)), key=cost)
+                best_x = min((best_x, landed(graduate(marked, inner, best_x, first_mu(REGRADUATE_RATIO2)).x)), key=cost)
             best_x, moves, *_ = across(
                 truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
             )

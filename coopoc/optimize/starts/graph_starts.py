@@ -180,8 +180,7 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
     for _ in range(SWEEPS):
         if factored is None:
             return rotation
-        matrices = columns_solved(factored, far * turned.mT.reshape(n * d, d)).reshape(n, d, d)
-        turned = nearest_rotation(matrices.mT)
+        turned = nearest_rotation(columns_solved(factored, far * turned.mT.reshape(n * d, d)).reshape(n, d, d).mT)
     part = parts(n, edges.nodes)
     still = firsts(part, held)[part]
     return rotation[still] @ turned[still].mT @ turned
@@ -243,8 +242,7 @@ def contenders(graph: Graph) -> tuple[str, ...]:
     """The starts that may differ on a graph, cheapest first: without loops all are chained odometry, but the file's
     vertices where they are a guess and not the truth."""
     from_file = ("file",) if graph.guess and np.isfinite(graph.position).all() else ()
-    edges = graph.relative_pose.nodes
-    loops = len(edges) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
+    loops = len(graph.relative_pose.nodes) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
     moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
     return (*("tree",) * (loops >= moved), "odometry", *from_file)
 
@@ -357,8 +355,7 @@ def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Probl
     for f, own in zip(problem.factors, rows, strict=True):
         kept[f.nodes[own]] = True
     part = restricted(problem, kept, x, rows)
-    still = np.flatnonzero((~free)[kept]).tolist()
-    return part.replace_unchecked(fixed=tuple(sorted({*part.fixed, *still}))), kept
+    return part.replace_unchecked(fixed=tuple(sorted({*part.fixed, *np.flatnonzero((~free)[kept]).tolist()}))), kept
 
 
 def _stages(graph: Graph) -> int:
@@ -366,8 +363,7 @@ def _stages(graph: Graph) -> int:
     longest = max(len(places) for places in graph.robots.values())
     turns = graph.relative_pose.covariance[:, graph.dimension :, graph.dimension :]
     variance = np.median(np.einsum("mii->m", turns) / turns.shape[-1]) if len(turns) else 0.0
-    drifting = min(longest * variance / DRIFT**2, 200)
-    return max(min(longest // STAGE, max(STAGES, int(drifting))), 1)
+    return max(min(longest // STAGE, max(STAGES, int(min(longest * variance / DRIFT**2, 200)))), 1)
 
 
 def position_variance(edges: PoseEdges | PointEdges, d: int) -> Floats:

@@ -250,8 +250,7 @@ def _moves(ranges: Ranges, loose: list[Ints], anyway: int) -> Iterator[Floats]:
     single.sort(key=lambda move: move[0])
     near = [move for move in single if move[0] <= most][:MAX_DESCENTS]
     several = (combinations(near, size) for size in range(2, len(near) + 1))
-    alone = single[: max(len(near), anyway)]
-    together = chain(combinations(alone, 1), *several)
+    together = chain(combinations(single[: max(len(near), anyway)], 1), *several)
     holding, points, space = ranges.nodes[(own < 0) & (own[:, ::-1] >= 0)], stacked(loose), ranges.problem.space
     if len(holding) and len(points) == len(loose) and (own >= 0).all(axis=1).any():
         image = mirrored(space.position(x[points]), space.position(x[holding]))
@@ -282,8 +281,7 @@ def across(
     least, count, ends = cost(x), 0, list[tuple[float, Floats]]()
     while count < 15:  # three are usual
         moves, ends = _moves(ranges_of(problem, x), loose, MOVED_NODES // len(x) - near) if loose else (), []
-        turns = islice(rewound(problem, x, RIVAL_COST), min(MAX_DESCENTS, MOVED_NODES // len(x)))
-        for start in chain(moves, turns):
+        for start in chain(moves, islice(rewound(problem, x, RIVAL_COST), min(MAX_DESCENTS, MOVED_NODES // len(x)))):
             end = descend(start)
             if (now := cost(end)) < (1.0 - MIN_SAVING) * least - 1e-9:
                 x, least, count = end, now, count + 1
@@ -350,8 +348,7 @@ def rewound(problem: Problem, x: Floats, most: float) -> Iterator[Floats]:
         bent = error.copy()
         bent[k] -= 2.0 * pi * left[k] / max(size[k], BRIDGE)
         rotation = exp(turns(bent)) @ turned
-        gap = at[j] - at[i] - (rotation[i] @ edges.position[..., None])[..., 0]
-        y = space.join(at + places(gap), rotation)
+        y = space.join(at + places(at[j] - at[i] - (rotation[i] @ edges.position[..., None])[..., 0]), rotation)
         y[list(problem.fixed)] = x[list(problem.fixed)]
         yield y
 
