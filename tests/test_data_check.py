@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.check import check
+from coopoc.data.log.estimates import factors
 from coopoc.data.log.read import Log, read_log
 from coopoc.data.registry import read_log as load_log
 
@@ -83,6 +85,14 @@ FAULTS: dict[str, tuple[Any, str]] = {
         r"car0: fixes lie \S+ m east and \S+ m north of the truth in the median. Has it another frame",
     ),
 }
+
+
+def test_hundreds_of_clocks_are_estimated_in_seconds():
+    row, began = np.arange(12000), process_time()
+    x = np.zeros((12000, 200))
+    x[row, row % 200] = np.sin(row)
+    assert_allclose(factors(x.sum(1) + 0.1 * np.cos(row), x, 0.1).value, 1.0, atol=0.1)
+    assert process_time() - began < 3.0
 
 
 def test_an_offset_of_ranges_is_taken_off(tmp_path):

@@ -136,7 +136,7 @@ def _wider(c: Check) -> Check:
     """The same, where fixes err by more than is stated: so do the positions of these vehicles."""
     links, nis = c.world.links, {row["vehicle"]: row["nis"] for row in c.vehicles if _beyond(row, "nis", OUTLYING)}
     factor = np.array([nis.get(name, 1.0) for name in c.world.ids])
-    more = factor[np.stack([links.observer, links.neighbour])].mean(axis=0)
+    more = factor[np.stack([links.observer, links.neighbour])].mean(0)
     noise = np.square(c.world.sensors.relative_std)
     return replace(c, expected=np.sqrt((c.expected**2 - noise) * more[:, None] + noise))
 
@@ -510,7 +510,7 @@ def _unseen(c: Check) -> Iterator[str]:
         {who: SURE_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
     ):
         yield f"errors, s, of the clocks of {blind}"
-    fixes = np.isfinite(c.fix[..., 0]).sum(axis=0)
+    fixes = np.isfinite(c.fix[..., 0]).sum(0)
     if few := [who for who in every if fixes[c.world.ids.index(who)] < LEAST_COUNT]:
         yield f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes"
 

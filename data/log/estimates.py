@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import scipy  # as in `residuals`
 from numpy import inf, nan
 from numpy.linalg import inv, lstsq, norm
+from scipy.sparse import csr_array, hstack
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
@@ -31,8 +32,9 @@ LEAST_FORWARD = 0.1
 """Share of a velocity along which odometry counts, or back, that shows by what it is late."""
 UNITS_APART = 0.2
 """Relative error of lengths from which their unit is wrong."""
-LEAST_COUNT, MIN_SAMPLES = 20, 6
-"""Measurements from which a statistic is reported, and from which causes are estimated."""
+LEAST_COUNT, MIN_SAMPLES, CONSTANT = 20, 6, 1e-9
+"""Measurements from which a statistic is reported, and from which causes are estimated; of a cause that is constant but
+for rounding, what its changes are at most."""
 FEW_PARTS, SURELY = 10, 3e-5
 """Parts of a drive below which a standard error is itself uncertain; chance of SURE_ERRORS to one side."""
 MOVED_STDS = 10.0
@@ -72,46 +74,64 @@ def no_estimate(count: int) -> Estimate:
     return Estimate(np.zeros(count), np.full(count, inf))
 
 
-def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, z: AnyArray | None = None) -> Estimate:
+def factors(y: AnyArray, x: Any, noise: float, groups: Ints | None = None, z: Any = None) -> Estimate:
     """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, less the means of groups (M,);
     and standard errors, as leaving out each part of the drive changes them. None is known where half of y stays, and
     that is OUTLYING times its noise: something else is wrong.
 
-    The instruments z (M, k), x itself if not given, are causes without the noise that is in both x and y.
+    The instruments z (M, k), x itself if not given, are causes without the noise that is in both x and y. Both may be
+    sparse.
 
     >>> time = np.arange(40.0)
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
-    none, seen = no_estimate(x.shape[1]), np.any(x, axis=0)
-    all_of, k = np.column_stack([y, x[:, seen], (x if z is None else z)[:, seen]]), int(seen.sum())
-    if len(y) < MIN_SAMPLES:
-        return none
+    none, count = no_estimate(x.shape[1]), x.shape[1] + 1
+    every = hstack([csr_array(each) for each in (y[:, None], x, x if z is None else z)], "csr")
     if groups is not None:
-        frame = pd.DataFrame(all_of)
-        all_of = (frame - frame.groupby(groups).transform("mean")).to_numpy()
-    y, x, z = all_of[:, 0], all_of[:, 1 : k + 1], all_of[:, k + 1 :].conj()
+        every = less_means(every, groups)
+    whole, varying = (np.asarray(abs(each).sum(0)) for each in (x, every[:, 1:count]))
+    seen = varying > CONSTANT * whole
+    causes, k = 1 + np.flatnonzero(seen), int(seen.sum())
+    if len(y) < MIN_SAMPLES or not k:
+        return none
+    yx, z = every[:, np.r_[0, causes]], every[:, count - 1 + causes]
+    row, cause = z.nonzero()
+    other = yx[row].tocoo()  # what a row adds to the sums: of many causes it has a few
+    row, cause = row[other.row], cause[other.row]
+    products = (z[row, cause].conj() * other.data).real, (row, cause * (k + 1) + other.col)
+    terms = csr_array(products, (len(y), k * (k + 1)))
+
+    def gap_of(factor: Floats) -> Floats:
+        return np.asarray(abs(yx @ np.r_[1.0, -factor]))
 
     def fitted(used: Bools) -> Floats:
         factor = np.zeros(k)
         for _ in range(3):
-            sums = (z[used].T @ all_of[used, : k + 1]).real
+            sums = (used @ terms).reshape(k, k + 1)
             factor = lstsq(sums[:, 1:], sums[:, 0])[0]
-            gap = abs(y - x @ factor)
+            gap = gap_of(factor)
             used = used & (gap <= OUTLYING * np.median(gap[used]))
         return factor
 
-    every = np.arange(len(y))
-    value = fitted(every >= 0)
-    before, left = (np.median(abs(gap)) for gap in (y, y - x @ value))
+    at = np.arange(len(y))
+    value = fitted(at >= 0)
+    before, left = (float(np.median(gap_of(factor))) for factor in (0.0 * value, value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
     count = min(DRIVE_PARTS, max(len(y) // 2, min(len(y), FEW_PARTS)))
     changes = value - np.stack(
-        [fitted(every * count // len(y) != part) for part in progress_bar(range(count), "check", delay=2.0)]
+        [fitted(at * count // len(y) != part) for part in progress_bar(range(count), "check", delay=2.0)]
     )
-    none.value[seen], none.error[seen] = value, np.where(np.any(x, axis=0), lasting(changes), inf)
+    none.value[seen], none.error[seen] = value, lasting(changes)
     return none
+
+
+def less_means(x: Any, groups: Ints) -> Any:
+    """Sparse x (M, k) less the means of its groups (M,)."""
+    here, size = np.arange(len(groups)), len(groups)
+    of = csr_array((np.ones(size), (np.unique(groups, return_inverse=True)[1], here)), (size, size))
+    return x - of.T @ (of @ x).multiply(1.0 / np.maximum(of.sum(1), 1.0)[:, None])
 
 
 def lasting(parts: Floats) -> Floats:
@@ -123,10 +143,10 @@ def lasting(parts: Floats) -> Floats:
     >>> bool(lasting(wander)[0] > 2.0 * 40**0.5 * wander.std())
     True
     """
-    errors, count = parts - parts.mean(axis=0), len(parts)
+    errors, count = parts - parts.mean(0), len(parts)
     few = np.divide(*scipy.stats.t.isf(SURELY, [min(count, FEW_PARTS) - 1, FEW_PARTS - 1]))
-    square = np.square(errors).sum(axis=0)
-    next_to = (errors[1:] * errors[:-1]).sum(axis=0) / np.maximum(square, 1e-300)
+    square = np.square(errors).sum(0)
+    next_to = (errors[1:] * errors[:-1]).sum(0) / np.maximum(square, 1e-300)
     correlation = ((count * next_to + 1.0) / (count - 4.0)).clip(0.0, 0.95)
     error: Floats = few * np.sqrt(square * (1.0 + correlation) / (1.0 - correlation))
     return error
@@ -172,7 +192,7 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     parts = at[: len(at) // means * means].reshape(-1, means)
     parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
     pace = np.gradient(path, rec.dt)
-    numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(axis=2)
+    numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(2)
     (fixes, path), gaps, at = numbers[:2], gaps[parts[:, 0]], parts[:, 0]
     times = MOVED_STDS if means == 1 else MOVED_STDS / 3
     noise = c.fix_noise / means**0.5
@@ -218,8 +238,7 @@ def odometry(c: Check, column: int) -> Estimate:
     if truth is None:
         each = moves(c, column)
         if each.shape[1] < LEAST_COUNT:
-            means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2)
-            each = moves(c, column, max(means, 1))
+            each = moves(c, column, max(int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2), 1))
         moved, driven, turns, bends, span = each
         square = max(np.square(abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
@@ -245,7 +264,7 @@ def odometry(c: Check, column: int) -> Estimate:
         heading = None if truth.heading is None else truth.heading[:, column]
         true = (abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)])
-    used = np.isfinite(odometer + x.sum(axis=0))
+    used = np.isfinite(odometer + x.sum(0))
     pace = np.maximum(abs(true), abs(odometer))
     used &= pace > min(MOVING, OF_FASTEST * np.nanmax(pace, initial=0.0))  # standing, nothing errs
     constant, usual = np.full(used.sum(), -1.0 if body is None else 0.0), norm(noise) / len(noise) ** 0.5
@@ -272,7 +291,7 @@ def _of_motion(y: AnyArray, x: AnyArray, constant: AnyArray, noise: float) -> Es
         unit = np.hstack([causes.real, causes.imag])
         unit /= np.maximum(norm(unit, axis=1, keepdims=True), 1e-12)
         alone = 1.0 / np.diag(inv(unit @ unit.T + 1e-9 * np.eye(len(unit))))
-        if extra and ((alone < MIN_OWN_SHARE) & unit.any(axis=1)).any():
+        if extra and ((alone < MIN_OWN_SHARE) & unit.any(1)).any():
             continue
         explained = factors(y, causes.T, noise)
         if norm(explained.value[extra]) >= 2.0 * norm(explained.error[extra]):
@@ -290,10 +309,10 @@ def _polar(turned: complex) -> Floats:
     return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
 
 
-def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimate, AnyArray, Ints]:
+def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimate, list[Any], Ints]:
     """By what each vehicle's clock is ahead of that of a reference, or of one that most agree with, s; if `alike`, by
-    what share all ranges are too long, and by what they are late, s: (N + 2,), what a range or direction misses for 1
-    of each (L, 2, K) that may be other than 0, and which these are: the clock of what stands shows nowhere.
+    what share all ranges are too long, and by what they are late, s: (N + 2,), what a range and what a direction
+    misses for 1 of each (L, K) that may be other than 0, and which these are: the clock of what stands shows nowhere.
 
     Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
     unit vector from i to j; where ranges are d s late, u (v_i - v_j) d.
@@ -303,41 +322,42 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     gap, _ = residual_of(world, c.x)
     flat, far = distances(gap)
     which = np.append(np.flatnonzero(~c.still), [size, size + 1])
-    eye = np.eye(size)[:, which[:-2]]
+    used = (which < size + 2 * alike) & (which != reference)
+    eye = csr_array(np.eye(size)[:, which[:-2]])
     ends = eye[links.neighbour] - eye[links.observer]
 
-    def made_by(velocity: Floats) -> Floats:
+    def made_by(velocity: Floats) -> list[Any]:
         moves = velocity[links.step, links.neighbour]
         along = np.vecdot(gap, moves) / far
         across = (gap[:, 0] * moves[:, 1] - gap[:, 1] * moves[:, 0]) / flat**2
         rate = np.vecdot(gap, velocity[links.step, links.observer] - moves) / far
-        of_range = np.column_stack([along[:, None] * ends, far, rate])
-        return np.stack([of_range, np.pad(across[:, None] * ends, ((0, 0), (0, 2)))], axis=1)
+        of_all = (along, np.column_stack([far, rate])), (across, np.zeros((len(far), 2)))
+        return [hstack([ends * each[:, None], csr_array(alike)], "csr")[:, used] for each, alike in of_all]
 
     velocity = np.nan_to_num(world.velocity[0])
-    used = (which < size + 2 * alike) & (which != reference)
-    made, then = (used * made_by(each) for each in (velocity, following(c, velocity)))
+    made, then = made_by(velocity), made_by(following(c, velocity))
+    which = which[used]
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
-    x, z, groups = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there]
+    x, z, groups = made[0][there], then[0][there], (pairs[0] * size + pairs[1])[there]
     value, error = no_estimate(size + 2)
     value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z)
     measured = np.unique(pairs[:, there])
     stay = max(noise**2 - world.sensors.range_std**2, 0.0) * share(c) / np.where(which < size, 2, len(measured) or 1)
-    varied = (pd.DataFrame(x).groupby(groups).transform("var", ddof=0).sum() / (x != 0.0).sum(axis=0)).clip(1e-12)
+    varied = np.maximum(less_means(x, groups).power(2).sum(0), 1e-12) / np.maximum((x != 0.0).sum(0), 1)
     error[which] = np.fmax(error[which], (stay / varied) ** 0.5)  # the filters' errors may last for the drive
     error[measured[measured == reference]] = 0.0
     if reference is None and len(measured):
         apart = abs(np.subtract.outer(value[measured], value[measured]))
-        return clocks(c, alike, measured[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(axis=1))])
+        return clocks(c, alike, measured[np.argmin((np.minimum(apart, LEAST_LAG) + 1e-3 * apart).sum(1))])
     return Estimate(value, ERRORS_LAST * error), made, which
 
 
 def share(c: Check) -> float:
     """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
-    fixes, noise = np.isfinite(c.normalised).sum(axis=0), np.square(c.world.sensors.fix_std[:2]).mean()
-    variance = pd.DataFrame(c.variance[..., :2].mean(axis=2)).mean()
+    fixes, noise = np.isfinite(c.normalised).sum(0), np.square(c.world.sensors.fix_std[:2]).mean()
+    variance = pd.DataFrame(c.variance[..., :2].mean(2)).mean()
     ratio = (variance + noise) / (variance * fixes).clip(1e-12)
     return min(2.0 * float(ratio.where(variance > 0.0, 0.0).max()), 1.0)
 
@@ -373,7 +393,7 @@ def lag_of_fixes(c: Check, column: int) -> float:
     places = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, nan, nan) for lag in [0.0, *lags])]
     moved = np.stack(places)[:, LEAST_COUNT:] - np.stack(places)[:, :-LEAST_COUNT]
     off = abs(moved[0] - moved[1:])
-    misses = np.where(np.isfinite(off).sum(axis=1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), inf)
+    misses = np.where(np.isfinite(off).sum(1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), inf)
     now, least, misses = misses[0], misses.min(), misses[1:]
     if least > min(OUTLYING * c.fix_noise, now / 2):
         return 0.0
@@ -396,7 +416,7 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
     truth, rec, noise = c.log.truth, c.world, c.world.sensors
     if truth is None:
         return c
-    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (c.still & ~truth.present.any(axis=0))
+    marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (c.still & ~truth.present.any(0))
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
     on_time = ~np.isin(rec.ids, late)
@@ -410,7 +430,7 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
         residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
     used = np.isfinite(residual)
     relative = np.where(used, residual, c.relative)
-    fit = (fits | marks | ~on_time)[[rec.links.observer, rec.links.neighbour]].all(axis=0)
+    fit = (fits | marks | ~on_time)[[rec.links.observer, rec.links.neighbour]].all(0)
     relative[~fit] = nan  # of others nothing is known
     x = np.where(np.isfinite(x), x, c.x)
     return replace(c, x=x, relative=relative, expected=np.where(used, stated, c.expected))
@@ -430,7 +450,7 @@ def on_time(c: Check, alike: bool, true: Check) -> Check:
     error[:size][abs(value[:size]) > LONG_LAG] = inf  # what is linear in a lag holds for small ones
     off = np.where(abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
-    relative[:, :2] -= np.nan_to_num(made @ off[which])
+    relative[:, :2] -= np.nan_to_num(np.column_stack([each @ off[which] for each in made]))
     ranges = tuple(zip(off[size:], error[size:], strict=True))
     return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], ranges=ranges)
 
