@@ -95,8 +95,8 @@ def assemble(
         table = np.stack([interpolate(t, x, grid, longest_gap(t, dt, max_gap)) for t, x in paths], axis=1)
         grid = start + grid
     present = np.isfinite(table[..., 0])
-    lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
-    for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
+    lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(0)
+    for k in np.flatnonzero(~present.any(0) | lonely).tolist():
         raise InputError(
             f"{file}: vehicle {ids[k]}",
             f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two consecutive",
@@ -186,7 +186,7 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
     for t, position in paths:
         each = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
-    (west, south), (east, north) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
+    (west, south), (east, north) = places.min(0).tolist(), places.max(0).tolist()
     near = max(east - west, north - south) < REGION
     if 0 < speed < MIN_TYPICAL_SPEED and near and max(-west, east) <= 360 and max(-south, north) <= 180:
         raise InputError(

@@ -250,7 +250,7 @@ def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     ones are known."""
     finite = np.isfinite(true)
     parts = (np.where(finite, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
-    sums = [part.reshape(-1, window, true.shape[1]).sum(axis=1).T for part in parts]
+    sums = [part.reshape(-1, window, true.shape[1]).sum(1).T for part in parts]
     pairs = zip(np.stack(sums[1:], axis=-1), sums[0], strict=True)
     return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
 

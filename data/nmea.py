@@ -61,9 +61,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             summary.refuse(reason, 1, where)
     frame = pd.DataFrame.from_dict(sentences.rows, orient="index")
     if FIX[0] not in frame:
-        raise InputError(
-            path.name, "0 fixes", "must hold NMEA sentences $..GGA", "Check that it holds GGA sentences with a fix."
-        )
+        raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA in ASCII", "Save it so, with fixes.")
     stds = [name for name in map(str, frame) if name.endswith("_std")]
     frame[stds] = frame.groupby("t")[stds].transform("last")
     early = frame["t"] < sentences.first_day  # sentences before the first date are of its day

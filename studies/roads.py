@@ -114,7 +114,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
                 continue
             track = method(recording.between(begin, stop), [column])
             gap, nees = planar(track, truth.between(begin, stop))
-            squares[begin:stop], seconds = np.square(gap[0, :, 0]).sum(axis=-1), seconds + track.seconds
+            squares[begin:stop], seconds = np.square(gap[0, :, 0]).sum(-1), seconds + track.seconds
             ratios.append(nees[0, max(start - begin, 0) :, 0])
         blocks += blocks_of(np.sqrt(squares)[:, None], start, size).ravel().tolist()
         axis[recording.ids[column]] = round(float(np.sqrt(np.nanmean(squares[start:]) / 2)), 4)
@@ -199,7 +199,7 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     track = method(recording, egos)
     gap, nees = planar(track, fleet)
     size = min(BLOCK_SECONDS, len(recording.t) * recording.dt / MIN_BLOCKS) / recording.dt
-    blocks = blocks_of(np.sqrt(np.vecdot(gap, gap).mean(axis=0)), 0, size)
+    blocks = blocks_of(np.sqrt(np.vecdot(gap, gap).mean(0)), 0, size)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
     row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}
     if track.covariance is not None:

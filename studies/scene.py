@@ -93,9 +93,9 @@ def egos(p: Params) -> tuple[str, ...]:
     if wanted != "auto" and not wanted.isdigit():
         return tuple(drive.ids[drive.index(i.strip())] for i in wanted.split("+" if "+" in wanted else ","))
     there, ids = _there(p["data"]), np.array(drive.ids)
-    chosen = ids[there.all(axis=0)]
+    chosen = ids[there.all(0)]
     if len(chosen) < (1 if wanted == "auto" else int(wanted)):
-        chosen = ids[(there[1:] & there[:-1]).any(axis=0)]
+        chosen = ids[(there[1:] & there[:-1]).any(0)]
     count = min(5, len(chosen)) if wanted == "auto" else int(wanted)
     if not 1 <= count <= len(chosen):
         allowed = f"must be a number of vehicles, 1..{len(chosen)}, or their ids"
@@ -187,7 +187,7 @@ def conditions(p: Params) -> str:
     labels = f" ({real.notes[0]})" if real is not None and real.notes else ""
     log = _log(p["data"])
     runs = log.recording.runs if log is not None and (log.messages or not channel(p).loss) else p["runs"]
-    name, there = Path(split(p["data"])[0]).name, _there(p["data"]).any(axis=0).sum()
+    name, there = Path(split(p["data"])[0]).name, _there(p["data"]).any(0).sum()
     size = f"{counted(runs, 'run')}, {counted(len(egos(p)), 'ego')} of {name} ({counted(there, 'vehicle')})"
     trained = f", {counted(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."

@@ -246,7 +246,7 @@ def _sybil(scene: Scene, rng: Draws) -> Made:
     """One vehicle beside an ego sends as several: all are measured where it is, and claim to be elsewhere together."""
     fleet, count = scene.fleet, int(rng.integers(1, 5))
     gap = norm(fleet.position[:, scene.others] - fleet.position[:, scene.egos[:1]], axis=-1)
-    liar = int(scene.others[np.argmin(gap.mean(axis=0))])
+    liar = int(scene.others[np.argmin(gap.mean(0))])
     toward, start = rng.uniform(-1.0, 1.0, (RUNS, 3)), rng.uniform(0.0, 25.0)
     offset = log_uniform(rng, 5.0, 40.0) * toward
     columns = [liar, *range(len(fleet.ids), len(fleet.ids) + count)]

@@ -122,8 +122,7 @@ def without(fleet: Fleet, *away: tuple[slice, int | slice]) -> Fleet:
 
 def coming_and_going(fleet: Fleet) -> Fleet:
     """Vehicles 2 to 4 come late, 4 to 6 leave early."""
-    third = len(fleet.t) // 3
-    return without(fleet, (slice(third), slice(2, 5)), (slice(2 * len(fleet.t) // 3, None), slice(4, 7)))
+    return without(fleet, (slice(len(fleet.t) // 3), slice(2, 5)), (slice(2 * len(fleet.t) // 3, None), slice(4, 7)))
 
 
 def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
@@ -141,8 +140,7 @@ def with_masts(fleet: Fleet, places: Any) -> Fleet:
 
 def among(many: Links, few: Links) -> Bools:
     """Which links are also those of a recording with fewer neighbours."""
-    keys = [links.step * 10**6 + links.observer * 1000 + links.neighbour for links in (many, few)]
-    return np.isin(*keys)
+    return np.isin(*[links.step * 10**6 + links.observer * 1000 + links.neighbour for links in (many, few)])
 
 
 def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None)) -> Recording:
@@ -156,8 +154,7 @@ def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None
 
 def slow_fixes(recording: Recording, every: int = 10) -> Recording:
     """A fix at every so many steps: at 1 Hz in data of 10 Hz."""
-    gnss = np.where(np.arange(len(recording.t))[:, None, None] % every, nan, recording.gnss)
-    return replace(recording, gnss=gnss)
+    return replace(recording, gnss=np.where(np.arange(len(recording.t))[:, None, None] % every, nan, recording.gnss))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ PAIR = Problem(AB).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 
 def torn(loss: Loss | None = None) -> Problem:
     """A point that two displacements from a held one place 140 m apart."""
-    held = Problem("oa", x0=np.eye(2, 3), fixed=(0,))
+    held = Problem([*"oa"], x0=np.eye(2, 3), fixed=(0,))
     return held.add("displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0, loss=loss)
 
 

@@ -67,8 +67,7 @@ def compare(known: str, recording: Recording):
 def held(gnss: Any) -> Any:
     """Each vehicle's last fix, its first one before that."""
     t = np.maximum.accumulate(np.where(np.isfinite(gnss[..., 0]), np.arange(len(gnss))[:, None], -1))
-    first = np.isfinite(gnss[..., 0]).argmax(axis=0)
-    return gnss[np.where(t < 0, first, t), np.arange(gnss.shape[1])]
+    return gnss[np.where(t < 0, np.isfinite(gnss[..., 0]).argmax(axis=0), t), np.arange(gnss.shape[1])]
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
@@ -109,8 +108,7 @@ def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy):
 
 def test_absent_egos_and_observers_are_named(crossing):
     recording = observe(coming_and_going(crossing), S2)
-    absent = BatchSmoother()(recording, [2]).absent
-    assert (absent[:, 0] >= np.isnan(recording.velocity[0, :, 2, 0])).all()
+    assert (BatchSmoother()(recording, [2]).absent[:, 0] >= np.isnan(recording.velocity[0, :, 2, 0])).all()
     with refused("observers"):
         BatchSmoother()(observe(crossing, S2, observers=[0, 3]), [0])
     with refused("numbers"):
@@ -153,8 +151,7 @@ def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing):
 @pytest.mark.parametrize("least", [1e-3, 1e-6, 1e-9])
 def test_who_hardly_moves_does_not_drown_the_rest(least, crossing):
     """Motion known to a nanometre, all at rest: SciPy's solution of the whole drive as one point per vehicle."""
-    fleet = standing(crossing.position[0], 60)
-    recording = observe(fleet, replace(S2, velocity_floor=1e-12), V2X(max_neighbours=4))
+    recording = observe(standing(crossing.position[0], 60), replace(S2, velocity_floor=1e-12), V2X(max_neighbours=4))
     known = NoiseModel("fitted", S2, process_std=(least, least, least), gnss_std=(3.0, 3.5, 4.0))
     track = textbook(BatchSmoother(known))(recording, range(8))
     residual = problem(recording, known)

@@ -24,8 +24,7 @@ def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing, body):
     again = in_world(body)
     assert np.array_equal(again.gnss, world.gnss)
     assert np.array_equal(again.relative[..., [0, 2]], world.relative[..., [0, 2]])
-    gap = np.exp(1j * (again.relative[..., 1] - world.relative[..., 1]))
-    assert abs(np.angle(gap)).max() < 1e-12
+    assert abs(np.angle(np.exp(1j * (again.relative[..., 1] - world.relative[..., 1])))).max() < 1e-12
 
 
 def test_exact_sensors_give_the_true_motion_back(crossing):
@@ -87,8 +86,7 @@ def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body, tmp_path):
     again, _ = read_recording(tmp_path / "body.npz")
     assert np.array_equal(again.body.yaw_rate, body.body.yaw_rate)
     assert np.array_equal(again.tags, body.tags)
-    part = body.between(10, 20).of_runs(slice(1, 3))
-    assert np.array_equal(part.body.heading, body.body.heading[1:3, 10:20])
+    assert np.array_equal(body.between(10, 20).of_runs(slice(1, 3)).body.heading, body.body.heading[1:3, 10:20])
 
 
 def test_who_has_no_heading_notes_tags(body):

@@ -150,8 +150,7 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours, fo
     """rms RT-LE against the bound beyond its interval (chi-square on the runs), and not far above it."""
     fleet = formation.between(0, 400)
     v2x = V2X(max_neighbours=neighbours)
-    recording = observe(fleet, S2, v2x, runs=40, observers=[0], seed=2)
-    square = (rt_le(method(recording, [0]), fleet) ** 2).mean(axis=1)
+    square = (rt_le(method(observe(fleet, S2, v2x, runs=40, observers=[0], seed=2), [0]), fleet) ** 2).mean(axis=1)
     least = bound_rt_le(posterior_bound(fleet, S2, 0, v2x)) ** 2
     assert least - half_width(square) < square.mean() < 1.15 * least
 
@@ -222,8 +221,7 @@ def test_pose_bounds_equal_gtsam_marginals(masts, compass):
     for t in (0, 5, 15):
         marginal = pose_marginals(flat, t + 1, sensors).marginalCovariance(node(0, t))
         world = block_diag(gtsam.Rot2(true_heading(flat)[t, 0]).matrix(), 1.0)
-        own = found[t][np.ix_([0, 1, 3], [0, 1, 3])]
-        assert own == pytest.approx(world @ marginal @ world.T, rel=1e-6, abs=1e-9)
+        assert found[t][np.ix_([0, 1, 3], [0, 1, 3])] == pytest.approx(world @ marginal @ world.T, rel=1e-6, abs=1e-9)
 
 
 def test_a_compass_and_a_gyro_alone_are_a_scalar_filter():
@@ -256,8 +254,7 @@ def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method, k, ma
     )
     sensors, v2x = replace(NOISE, **lasting), co.V2X(max_neighbours=k, radius=60.0)
     marks = [name for name in fleet.ids if name[0] == "m"]
-    seen = co.observe(fleet, sensors, v2x, runs=120, seed=3, frame="body", landmarks=marks)
-    track = method(seen, [0])
+    track = method(co.observe(fleet, sensors, v2x, runs=120, seed=3, frame="body", landmarks=marks), [0])
     bound = co.pose_bound(fleet, sensors, v2x, landmarks=marks)[:, 0]
     position = np.square(track.x - fleet.position[:, :1]).sum(axis=-1)[:, 10:, 0].mean(axis=1)
     heading = np.square(co.heading_error(track, fleet))[:, 10:, 0].mean(axis=1)

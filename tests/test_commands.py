@@ -89,8 +89,7 @@ def folder(tmp_path_factory):
     assert body
     (out / "robots.py").write_text(body.group(1))
     python("robots.py", cwd=out)
-    log = (out / "mylog" / "measurements.csv").read_text()
-    (out / "log.csv").write_text(log.replace("t,vehicle", "zeit,auto", 1))
+    (out / "log.csv").write_text((out / "mylog" / "measurements.csv").read_text().replace("t,vehicle", "zeit,auto", 1))
     fleet = co.load_fleet("town10").between(0, 50)
     rows = [
         f"{t},{k},{x},{y},{z}" for t, xs in zip(fleet.t, fleet.position, strict=True) for k, (x, y, z) in enumerate(xs)

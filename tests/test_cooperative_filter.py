@@ -228,8 +228,7 @@ def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
         off_then = moved(seen, 10 // step * np.array(wrong), 24, [0.8 * off, -0.6 * off, 0.0])
         for m in (Kalman(), JointFilter(), CooperativeFilter()):
             for sees in (seen.relative, relative):
-                track = m(replace(off_then, relative=sees), [24])
-                assert errors(track, fleet)[:, late:].max() < 8.0
+                assert errors(m(replace(off_then, relative=sees), [24]), fleet)[:, late:].max() < 8.0
 
 
 @EITHER

@@ -144,8 +144,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
     begin = np.full((4, 4), np.nan)
     begin[columns] = [[*place[0], 0.0, heading[0]] for place, heading, _, _ in drives().values()]
     track = replace(co.PoseFilter("fleet"), begin=begin)(log.recording, list(CARS))
-    truth = np.stack([place for place, _, _, _ in drives().values()], axis=1)
-    assert abs(track.x[0, ..., :2] - truth).max() < 0.1
+    assert abs(track.x[0, ..., :2] - np.stack([place for place, _, _, _ in drives().values()], axis=1)).max() < 0.1
 
 
 @pytest.mark.parametrize(
@@ -218,8 +217,7 @@ def test_what_no_filter_can_follow_is_still_summarised(tmp_path):
     frame, _ = table(compass=False)
     frame = frame[~frame["kind"].isin(["x", "y"]) & (frame["vehicle"] != "mast")]
     frame.to_csv(tmp_path / "log.csv")
-    command = [sys.executable, "-m", "coopoc.cli", "data", "check", "log.csv?frame=body"]
-    done = ran(command, cwd=tmp_path, check=True)
+    done = ran([sys.executable, "-m", "coopoc.cli", "data", "check", "log.csv?frame=body"], cwd=tmp_path, check=True)
     assert "400 samples of odometry" in done.stdout
     assert "no filter follows it" in done.stdout
 

@@ -47,8 +47,7 @@ def test_town10_is_dense_and_urban():
     assert 5 <= stated["neighbours"]["mean"] <= 7
     assert stated["speed"]["max"] < 11.1
     assert stated["speed"]["standing"] < 0.3
-    path = norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0)
-    assert path.min() > 90, "every vehicle drives, m in 90 s"
+    assert norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0).min() > 90, "every vehicle drives, m in 90 s"
 
 
 def test_clients_have_the_papers_lengths_and_speeds():

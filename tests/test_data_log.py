@@ -70,8 +70,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
     origin = (48.14, 11.58, 520.0)
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, 0].T, *origin)
     frame = pd.DataFrame({"time": fleet.t, "lat": lat, "lon": lon, "alt": h, "speed_kmh": 8 * 3.6, "both": 3.0})
-    course = np.degrees(np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]))
-    frame["yaw"] = (90 - course) % 360
+    frame["yaw"] = (90 - np.degrees(np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]))) % 360
     write(frame, tmp_path / "car7.csv")
     names = {"t": "time", "latitude": "lat", "longitude": "lon", "height": "alt", "compass_deg": "yaw"}
     log = read_log(tmp_path / "car7.csv", columns=names, origin=origin)
@@ -111,7 +110,9 @@ def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhe
     (tmp_path / "log").mkdir()
     write(fixes, tmp_path / "log" / "fixes.csv")
     write(motion, tmp_path / "log" / "motion.csv")
+    (tmp_path / "log" / "truth.csv.gz").touch()
     log = read_log(tmp_path / "log")
+    assert log.summary.refused["files of kinds that are not read"] == (1, "truth.csv.gz")
     assert log.recording.sensors.gnss_std[:2] == pytest.approx((2.5, 2.5))
     assert any("std of fixes.csv is the standard deviation of each of x, y" in one for one in log.summary.assumed)
     mixed = read_log(write(fixes.assign(vx=5.0, vy=0.0, value=1.0), tmp_path / "mixed.csv"))
@@ -225,8 +226,7 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
     write(pd.DataFrame(truth, columns=["t", "vehicle", "x", "y"]), tmp_path / "truth.csv")
     log = read_log(tmp_path / "log.csv", truth=tmp_path / "truth.csv")
     assert log.recording.sensors.velocity_floor == pytest.approx(np.sqrt((0.1**2 + 4 * (10 * 0.05) ** 2) / 2), rel=0.01)
-    track = co.Kalman()(log.recording, list(log.recording.ids))
-    assert 1.2 < nees(track, log.truth)[:, 100:].mean() < 2.8
+    assert 1.2 < nees(co.Kalman()(log.recording, list(log.recording.ids)), log.truth)[:, 100:].mean() < 2.8
 
 
 LATE = 0.04

@@ -98,16 +98,14 @@ def test_settings_of_simulated_noise_do_nothing_on_a_log_and_the_caption_says_so
 
 
 def test_innovations_take_the_place_of_scores(folders, tmp_path):
-    settings = {**FEW, "data": str(folders / "without")}
-    results = co.run_study("side_by_side", tmp_path, settings=settings, progress=False)
+    results = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": str(folders / "without")}, progress=False)
     assert not results.failed
     rows = results.frame
     assert "rt_le_m" not in rows or rows["rt_le_m"].isna().all()
     means = rows[rows["method"] != "bound"].groupby("method")["innovation_m"].mean()
     assert means["kalman"] < means["gnss"]
     assert 0.8 < rows.query("method == 'kalman'")["nis"].mean() < 1.2
-    tables = sorted(file.stem for file in (tmp_path / "side_by_side").rglob("*.md"))
-    assert {"innovation", "nis"} <= set(tables)
+    assert {"innovation", "nis"} <= {file.stem for file in (tmp_path / "side_by_side").rglob("*.md")}
 
 
 @pytest.mark.parametrize(("options", "offset", "most"), [("", 2.0, 1.0), ("?dt=0.1", 0.0, 0.97), ("", 0.0, 0.93)])
@@ -235,8 +233,7 @@ def test_the_check_says_what_looks_wrong(tmp_path, case, stated):
 
 
 def test_stamps_in_milliseconds_are_found(tmp_path):
-    log = long(observed(drive(4, gap=15.0)), messages=False).eval("t = 1000 * t")
-    file = write(log, tmp_path / "log.csv")
+    file = write(long(observed(drive(4, gap=15.0)), messages=False).eval("t = 1000 * t"), tmp_path / "log.csv")
     assert any("Is t in ms" in warning for warning in check(read_log(file, dt=100, max_gap=1e4)).warnings)
 
 

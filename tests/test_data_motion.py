@@ -202,8 +202,7 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     notes = co.Kalman()(log(tmp_path / "spun", "car", 1.0, 10, **spun)[0].recording).notes
     assert any(note.startswith("odometry, a: fails") for note in notes)
     coarse = co.read_log(tmp_path / "gyro", dt=0.5).recording
-    pace = norm(coarse.velocity[0, 1:, 0], axis=1)
-    assert np.nanmax(abs(pace - np.interp(coarse.t[1:], T, speed))) < 1.5
+    assert np.nanmax(abs(norm(coarse.velocity[0, 1:, 0], axis=1) - np.interp(coarse.t[1:], T, speed))) < 1.5
 
 
 @pytest.mark.parametrize("std", [0.05, 1.5])
@@ -219,14 +218,12 @@ def test_a_course_that_is_held_without_fixes_is_lost_on_bends(tmp_path, method):
     read = log(tmp_path, "car", 1.5, 10, steps=TUNNEL, speed=SPEED)[0]
     track = method(read.recording)
     behind = np.flatnonzero(read.recording.t > 92)
-    off = norm(track.x[0, behind, 0] - read.truth.position[behind, 0], axis=1)
-    assert np.sqrt(np.mean(off**2)) < 3.0
+    assert np.sqrt(np.mean(norm(track.x[0, behind, 0] - read.truth.position[behind, 0], axis=1) ** 2)) < 3.0
     assert np.nanmean(co.nees(track, read.truth)) < 4.0
 
 
 def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path):
-    read = log(tmp_path / "log", "car", 1.5, 10, speed=SPEED, yaw_rate=-RATE)[0]
-    sentences = " ".join(check(read).warnings)
+    sentences = " ".join(check(log(tmp_path / "log", "car", 1.5, 10, speed=SPEED, yaw_rate=-RATE)[0]).warnings)
     assert "scale=yaw_rate:-1 mends it" in sentences
     assert "odometry" not in sentences.replace("of fixes and odometry are", "")
 

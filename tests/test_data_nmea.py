@@ -168,8 +168,7 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):
     assert read_log(path, dt=0.1, ignore=["x", "y", "z", "heading"]).recording.gnss.shape[2] == 2
     actual = read_log(path, dt=0.1, truth="/car0/pose", origin=(48.14, 11.58, 560.0), frame="body").truth
     assert_allclose(actual.position[:, 0], fleet.position[:, 0], atol=1e-6)
-    course = np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0])
-    assert_allclose(actual.heading[:, 0], course, atol=1e-6)
+    assert_allclose(actual.heading[:, 0], np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]), atol=1e-6)
     body = read_log(path, dt=0.1, ignore=["/car0/pose", "/car1/imu"], frame="body").recording.body
     assert abs(body.yaw_rate[0]).max(axis=0) == pytest.approx([0.06, 0.0], abs=1e-3)
     stands = read_log(path, dt=0.1, ignore=["/car0/pose"], truth="/car1/odom", origin=(48.14, 11.58, 560.0)).truth

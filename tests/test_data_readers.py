@@ -35,8 +35,7 @@ def test_tum_files_are_what_evo_reads(tmp_path):
     """Independent check: evo reads the file that we write (evo is a tool of the tests only)."""
     fleet = load_fleet("town10-clients")
     x = fleet.position[:1550, 0]
-    still = np.tile([0.0, 0.0, 0.0, 1.0], (1550, 1))
-    np.savetxt(tmp_path / "car.tum", np.c_[fleet.t[:1550], x, still], fmt="%.17g")
+    np.savetxt(tmp_path / "car.tum", np.c_[fleet.t[:1550], x, np.tile([0.0, 0.0, 0.0, 1.0], (1550, 1))], fmt="%.17g")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface", reason="pip install evo")

@@ -124,6 +124,5 @@ def test_every_solver_follows_the_world(backend, change, crossing):
         here, there = (solve(Problem.from_window(seen, 7, "c0", window), backend) for seen in (rec, world.of(rec)))
         column = [there.names.index(name) for name in here.names]
         assert_allclose(there.position[column], here.position @ world.matrix.T + world.shift, atol=1e-6)
-        turned = world.matrix @ here.covariance @ world.matrix.T
-        assert_allclose(there.covariance[column], turned, rtol=1e-6, atol=1e-7)
+        assert_allclose(there.covariance[column], world.matrix @ here.covariance @ world.matrix.T, rtol=1e-6, atol=1e-7)
         assert there.cost == pytest.approx(here.cost, rel=1e-7)

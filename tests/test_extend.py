@@ -37,8 +37,7 @@ def blocks(language: str) -> list[str]:
 
 def shell(command: str, folder: Path, **env: str) -> str:
     """What a command prints; the test fails with its complaint if it fails."""
-    script = command.replace("coopoc ", f"{COOPOC} ", 1)
-    return python(*script.split(), cwd=folder, env={**os.environ, **env})
+    return python(*command.replace("coopoc ", f"{COOPOC} ", 1).split(), cwd=folder, env={**os.environ, **env})
 
 
 @pytest.fixture(scope="module")

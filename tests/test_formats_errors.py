@@ -40,7 +40,7 @@ BAD_PYFG = {
     "name": ("VERTEX_XY L0", "VERTEX_XY beacon", "line 3 = vertex beacon", "a letter and a number"),
     "mixed": ("VERTEX_XY L0 3 4", "VERTEX_XYZ L0 3 4 5", "line 3 = VERTEX_XYZ", "must be 2-D as line 1, VERTEX_SE2"),
     "empty": (PYFG, "# nothing\n", "a.pyfg = 0 vertices", "complete"),
-    "binary": ("EDGE_RANGE", "\udcff", "a.pyfg", "text"),
+    "binary": ("EDGE_RANGE", "\udcff", "a.pyfg", "text in UTF-8"),
 }
 
 

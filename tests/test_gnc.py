@@ -45,7 +45,7 @@ def test_of_all_subsets_it_finds_the_best():
         rng = default_rng(seed)
         z = rng.normal(size=(9, 3))
         z[: seed % 5] += rng.uniform(-40, 40, (seed % 5, 3))
-        problem = Problem("a").add("position", ["a"], [[0, 0, 0]], std=3.0).add("position", ["a"] * 9, z, std=1.0)
+        problem = Problem([*"a"]).add("position", ["a"], [[0, 0, 0]], std=3.0).add("position", ["a"] * 9, z, std=1.0)
         bound = chi2.ppf(0.99, 3)
         chosen = np.array(list(itertools.product([0.0, 1.0], repeat=9)))
         x = chosen @ z / (chosen.sum(axis=1, keepdims=True) + 1 / 9)
@@ -62,7 +62,7 @@ def test_of_all_subsets_it_finds_the_best():
 def test_a_group_is_one_hypothesis():
     """Five fixes 3 std off: 9 is within the 11.3 of one, 45 is not within the 30.6 of five (chi-square, 99 %)."""
     z = np.outer(np.arange(14) >= 9, [3.0, 0, 0])
-    problem = Problem("a").add("position", ["a"] * 4, z[:4], std=0.05).add("position", ["a"] * 10, z[4:], std=1.0)
+    problem = Problem([*"a"]).add("position", ["a"] * 4, z[:4], std=0.05).add("position", ["a"] * 10, z[4:], std=1.0)
     assert (solve_gnc(problem, [1]).extras["weights"] == 1).all()
     together = solve_gnc(problem, [1], groups=["honest"] * 5 + ["spoofed"] * 5)
     assert together.extras["weights"].tolist() == [1.0] * 5 + [0.0] * 5
@@ -134,7 +134,7 @@ def test_gnc_that_rejects_every_measurement_is_reported():
 
 def test_a_limit_of_rounds_is_a_status(monkeypatch):
     z = np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0])
-    problem = Problem("a").add("position", ["a"] * 12, z, std=1.0)
+    problem = Problem([*"a"]).add("position", ["a"] * 12, z, std=1.0)
     monkeypatch.setattr(graduated, "MAX_ROUNDS", 2)
     with pytest.raises(SolveError) as caught:
         solve_gnc(problem, [0])

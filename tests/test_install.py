@@ -29,8 +29,7 @@ def site(tmp_path_factory):
 
 def outside(site: Path, tmp_path: Path, *command: str) -> str:
     """Output of a command run in an empty folder that sees the installed wheel first."""
-    env = {**os.environ, "PYTHONPATH": str(site), "MYPYPATH": str(site)}
-    return python(*command, cwd=tmp_path, env=env)
+    return python(*command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(site), "MYPYPATH": str(site)})
 
 
 def test_everything_imports_from_the_wheel(site, tmp_path):
@@ -51,8 +50,7 @@ print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in
 
 @pytest.mark.slow
 def test_installed_package_is_strictly_typed(site, tmp_path):
-    config = str(ROOT / "pyproject.toml")
-    outside(site, tmp_path, "-m", "mypy", "--strict", "--config-file", config, "-p", "coopoc")
+    outside(site, tmp_path, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml"), "-p", "coopoc")
 
 
 WITHOUT_TORCH = """

@@ -40,5 +40,4 @@ def test_a_start_that_is_known_has_no_nees(crossing):
     assert np.isnan(found[:, 0]).all()
     assert np.isfinite(found[:, 1:]).all()
     gap = (known.x - crossing.position[:, [0]])[:, 1:]
-    solved = solve(known.covariance[:, 1:], gap[..., None])[..., 0]
-    assert_allclose(found[:, 1:], np.vecdot(gap, solved), rtol=1e-9)
+    assert_allclose(found[:, 1:], np.vecdot(gap, solve(known.covariance[:, 1:], gap[..., None])[..., 0]), rtol=1e-9)

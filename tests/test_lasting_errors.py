@@ -54,8 +54,7 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale, priors):
             peer.update(np.array([[seen.gnss[0, k, 0, 0]]]))
             likely[i] += peer.log_likelihood
         there = 1.0 / (1.0 + np.exp(likely[0] - likely[1]))
-        mean = (1 - there) * filters[0].x[0, 0] + there * filters[1].x[0, 0]
-        assert_allclose(track.x[0, k, 0, 0], mean, atol=2e-3)
+        assert_allclose(track.x[0, k, 0, 0], (1 - there) * filters[0].x[0, 0] + there * filters[1].x[0, 0], atol=2e-3)
     assert track.extras["scale_error"][0, -1, 0] == pytest.approx(there * filters[1].x[1, 0], abs=1e-4)
 
 

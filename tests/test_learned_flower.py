@@ -115,8 +115,7 @@ def test_the_rounds_are_those_of_federate(rule):
         torch.testing.assert_close(mine.weights, theirs.weights, rtol=0, atol=1e-6)
         assert mine.validation_loss == pytest.approx(theirs.validation_loss, rel=1e-4)
         assert mine.training_loss == pytest.approx(theirs.training_loss, rel=1e-4)
-    losses = [expected.validation_loss(row) for row in expected.history[1:]]
-    assert found.best.number == 1 + int(np.argmin(losses))
+    assert found.best.number == 1 + int(np.argmin([expected.validation_loss(row) for row in expected.history[1:]]))
 
 
 def sends(name: str, weights: Tensor, **changes: object) -> Node:

@@ -164,8 +164,7 @@ def test_only_registered_keys_over_tls_come_in(tmp_path, mark, example):
         }
         refused = {name: example.supernode(site, name, options) for name, options in who.items()}
         out = tmp_path / "fedkalmannet.safetensors"
-        run = example.submit(site, [f'change="rounds=2 {CHANGE}"', "nodes=2", f'out="{out}"'])
-        example.finished(run, "flwr run")
+        example.finished(example.submit(site, [f'change="rounds=2 {CHANGE}"', "nodes=2", f'out="{out}"']), "flwr run")
         for name, process in refused.items():
             assert process.wait(120) != 0, name
             assert "Failed to initialize the connection to the SuperLink" in example.log(site, name)

@@ -31,8 +31,7 @@ def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> 
     rng, t = default_rng(seed), np.arange(steps) / 10
     position = np.cumsum(rng.normal(0, 0.2, (steps, vehicles, 3)), axis=0)
     fleet = Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, np.full((steps, vehicles, 3), 1e-9))
-    recording = observe(fleet, Sensors(gnss_std=(1.5, 1.5, 1.5)), V2X(max_neighbours=0))
-    return slow_fixes(recording, every), fleet
+    return slow_fixes(observe(fleet, Sensors(gnss_std=(1.5, 1.5, 1.5)), V2X(max_neighbours=0)), every), fleet
 
 
 def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:
@@ -81,8 +80,7 @@ def test_a_gap_of_the_odometry_is_in_no_piece_and_one_of_the_truth_has_no_loss()
 def test_steps_without_a_truth_have_no_loss(net):
     """A truth that ends early: losses and gradients of the drive that ends there, which knows nothing of masks."""
     whole, theta = batch(), flatten([net])
-    known = torch.arange(30)[:, None, None, None] < 18
-    masked = whole._replace(truth=torch.where(known, whole.truth, torch.nan))
+    masked = whole._replace(truth=torch.where(torch.arange(30)[:, None, None, None] < 18, whole.truth, torch.nan))
     short = Batch(whole.gnss[:18], whole.velocity[:18], whole.truth[:18], whole.x0, whole.dt)
     torch.testing.assert_close(net.losses(theta, masked), net.losses(theta, short), rtol=1e-5, atol=1e-6)
     for ours, theirs in zip(net.loss_and_gradient(theta, masked), net.loss_and_gradient(theta, short), strict=True):
@@ -197,5 +195,4 @@ def test_every_recipe_trains_on_a_log_and_follows_the_rest(name, log, tmp_path, 
         assert np.isfinite(checkpoint.card.get("validation_loss", 0.0)).all()
         assert all(np.isfinite(row["validation_loss"]).all() for row in checkpoint.card.get("history", ()))
         assert checkpoint.history is None or not torch.equal(checkpoint.history[0], checkpoint.history[-1])
-        track = checkpoint.model.method(name)(rest.recording, ["a", "b"])
-        assert co.rt_le(track, rest.truth).max() < 10.0
+        assert co.rt_le(checkpoint.model.method(name)(rest.recording, ["a", "b"]), rest.truth).max() < 10.0

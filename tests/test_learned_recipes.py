@@ -36,15 +36,13 @@ def drives() -> Fleet:
 def quick(monkeypatch):
     """The recipes with a few steps on short pieces."""
     for name, recipe in recipes.RECIPES.items():
-        schedule = Schedule(epochs=3, batch=2, checks=2)
-        quicker = replace(recipe, schedule=schedule, rounds=2, local_epochs=1, piece=10)
+        quicker = replace(recipe, schedule=Schedule(epochs=3, batch=2, checks=2), rounds=2, local_epochs=1, piece=10)
         monkeypatch.setitem(recipes.RECIPES, name, quicker)
 
 
 def test_checkpoint_round_trip(tmp_path):
     net, history = GainNet(seed=4), flatten([GainNet(seed=1), GainNet(seed=2)])
-    path = save(tmp_path / "net.safetensors", Checkpoint(net, {"recipe": "mine", "best": 3}, history))
-    again = load(path)
+    again = load(save(tmp_path / "net.safetensors", Checkpoint(net, {"recipe": "mine", "best": 3}, history)))
     assert isinstance(again.model, GainNet)
     assert torch.equal(flatten([again.model]), flatten([net]))
     assert torch.equal(flatten([again.after(1)]), history[1:])
@@ -162,8 +160,7 @@ EACH = pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIG
 def test_shipped_weights_hold_over_unseen_drives(name):
     """They trained on pieces of 100 steps and other vehicles; here are 900 steps, and no run may drift away."""
     fleet, method = load_fleet("town10"), load_method(name)
-    card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
-    assert card["digest"] == load_fleet("town10-clients").digest
+    assert read_card(recipes.WEIGHTS / f"{name}.safetensors")["digest"] == load_fleet("town10-clients").digest
     some = fleet.select(fleet.ids[::10])
     recording = observe(some, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=3)
     found, egos = method(recording, range(6)), range(6)
@@ -205,8 +202,7 @@ def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path):
     path = save(tmp_path / "okf.safetensors", Checkpoint(NoiseParameters(), {"recipe": "okf", "seconds": 5.25}))
     whole = path.read_bytes()
     weights = range(8 * (len(whole) - 36), 8 * len(whole))
-    others = np.random.default_rng(0).choice(weights.start, 300, replace=False).tolist()
-    for bit in (*weights, *others):
+    for bit in (*weights, *np.random.default_rng(0).choice(weights.start, 300, replace=False).tolist()):
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)

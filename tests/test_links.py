@@ -61,8 +61,7 @@ def test_every_relative_link_leads_to_a_tracked_file():
 def test_links_to_sources_lead_to_the_made_pages_of_the_site():
     pytest.importorskip("mkdocs")
     code = "import pages; print(pages.on_page_markdown('[a](tutorials/solve.py) [b](../studies) [c](learned.md)'))"
-    out = python("-c", code, cwd=ROOT / "docs")
-    assert out == "[a](tutorials/solve.md) [b](gallery.md) [c](learned.md)\n"
+    assert python("-c", code, cwd=ROOT / "docs") == "[a](tutorials/solve.md) [b](gallery.md) [c](learned.md)\n"
 
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)

@@ -64,8 +64,7 @@ def test_a_track_without_ids_names_columns_and_leaves_out_what_it_has_not():
 def test_the_table_of_a_fleet_is_read_again_without_the_absent(tmp_path):
     position, velocity = rng.normal(size=(2, 5, 3, 3))
     position[:2, 1] = velocity[:2, 1] = np.nan
-    fleet = co.Fleet(IDS, np.arange(5) * 0.1, position, velocity, heading=rng.uniform(-3, 3, (5, 3)))
-    frame = fleet.to_frame()
+    frame = co.Fleet(IDS, np.arange(5) * 0.1, position, velocity, heading=rng.uniform(-3, 3, (5, 3))).to_frame()
     assert frame.columns.tolist() == ["step", "t", "vehicle", "x", "y", "z", "vx", "vy", "vz", "heading"]
     assert len(frame) == 13
     assert not frame.isna().any(axis=None)

@@ -41,8 +41,7 @@ def test_a_run_and_a_step_know_nothing_of_others(name, noise, crossing):
     assert method(replace(seen, t=seen.t + 1.7e9), [0]).x == pytest.approx(many, abs=1e-3)
     assert method(observe(fleet, S2, channel), [0]).x == pytest.approx(many[:1], abs=1e-8)
     if name != "batch-smoother":
-        short = method(observe(fleet.between(0, 8), S2, channel, runs=5), [0]).x
-        assert short == pytest.approx(many[:, :8], abs=1e-8)
+        assert method(observe(fleet.between(0, 8), S2, channel, runs=5), [0]).x == pytest.approx(many[:, :8], abs=1e-8)
 
 
 @pytest.mark.parametrize("channel", [V2X(max_neighbours=0), V2X(4, loss=1.0)], ids=["alone", "no message arrives"])
@@ -83,8 +82,7 @@ def test_filters_that_claim_a_covariance_are_consistent(name, formation):
     """NEES gate: 95 % of the steps have their run-averaged NEES in the 99 % chi-square band; noise without bias."""
     fleet = formation.between(0, 300)
     recording = observe(fleet, S2, V2X(max_neighbours=6), runs=40, seed=1, observers=[0])
-    squares = nees(METHODS[name]("nominal")(recording, [0]), fleet)
-    assert share_of_average(squares.mean(axis=0), 40).min() >= 0.95
+    assert share_of_average(nees(METHODS[name]("nominal")(recording, [0]), fleet).mean(axis=0), 40).min() >= 0.95
 
 
 def test_a_fitted_noise_model_finds_the_acting_noise(formation):
@@ -117,8 +115,7 @@ def test_the_floor_of_a_range_is_the_spread_of_its_arc(formation):
     seen = observe(formation, Sensors(range_std=0.01, azimuth_std=0.1, inclination_std=0.05), V2X(2))
     seen = replace(seen, relative=np.where([True, False, False], 20.0, seen.relative))
     known = resolve("nominal", seen).sensors
-    arc = 20.0 * np.hypot(0.1**2, 0.05**2) / np.sqrt(2)
-    assert known.range_std == pytest.approx(np.hypot(arc, 0.01), rel=1e-9)
+    assert known.range_std == pytest.approx(np.hypot(20.0 * np.hypot(0.1**2, 0.05**2) / np.sqrt(2), 0.01), rel=1e-9)
 
 
 def test_a_bad_noise_model_is_named(crossing):
@@ -137,8 +134,7 @@ def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing):
     recording = observe(without(crossing, (slice(20, 40), 1)).between(18, 42), S2, V2X(max_neighbours=7), runs=2)
     for make in METHODS.values():
         assert np.isfinite(make("nominal")(recording, [0]).x).all()
-    absent = Kalman()(recording, [1]).absent
-    np.testing.assert_array_equal(absent[:, 0], np.isnan(recording.velocity[0, :, 1, 0]))
+    np.testing.assert_array_equal(Kalman()(recording, [1]).absent[:, 0], np.isnan(recording.velocity[0, :, 1, 0]))
 
 
 def test_nees_of_a_singular_covariance_is_refused(crossing):

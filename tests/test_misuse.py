@@ -374,15 +374,14 @@ def test_solvers_refuse_arguments_of_the_wrong_kind():
     solution = co.solve(whole)
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
     with refused("nodes = 10000 nodes: must name each of 2 nodes once"):
-        optimize.joint_covariance(whole, solution, "a" * 10_000)
+        optimize.joint_covariance(whole, solution, ["a"] * 10_000)
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(optimize.loop_closures, {"problem": whole})
     swept(solution.__getitem__, {"point": "a"})
     swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
     swept(PAIR.add, {"kind": "range", "nodes": AB, "z": 9.0, "std": 1.0, "loss": None})
     swept(PAIR.constrain, {"kind": "range", "nodes": AB, "lower": 1.0, "upper": 9.0})
-    window = {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None}
-    swept(co.Problem.from_window, window)
+    swept(co.Problem.from_window, {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None})
     named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 
@@ -423,8 +422,7 @@ def test_training_refuses_values_from_elsewhere():
     for made in (schedule, learned.Participation(), learned.Setting(), learned.Recipe("okf"), client):
         swept(type(made), init(made), wrong)
     swept(learned.Segments, init(client.training), HOSTILE)
-    given = {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}
-    swept(learned.clients, given, (*ALL, RECORDING))
+    swept(learned.clients, {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}, (*ALL, RECORDING))
     swept(learned.OptimisedKF, {"process_std": (1, 1, 1), "velocity_ratio": (1, 1, 1), "gnss_std": (1, 1, 1)}, wrong)
     few = (None, -1, 1.5, "x", [], *HOSTILE)
     net = learned.NoiseParameters()
@@ -433,8 +431,7 @@ def test_training_refuses_values_from_elsewhere():
     fit = {"model": net, "training": client.training, "validation": client.validation, "schedule": schedule, "seed": 0}
     swept(learned.fit, {**fit, "progress": None, "long": None}, few)
     federation = {"model": "okf", "clients": [client], "rounds": 1, "local_epochs": 1, "schedule": schedule, "seed": 0}
-    more = dict.fromkeys(("progress", "participation"))
-    swept(learned.federate, {**federation, **more, "aggregate": "mean"}, few)
+    swept(learned.federate, {**federation, **dict.fromkeys(("progress", "participation")), "aggregate": "mean"}, few)
     swept(learned.ledger, {"federation": learned.federate(**federation), "overhead": 0}, wrong)
     swept(learned.LearnedGain, {"model": learned.GainNet(), "name": "n", "x0": None}, wrong)
     with refused("out = /dev/null: cannot be made"):

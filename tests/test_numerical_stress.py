@@ -87,8 +87,7 @@ def test_estimates_stay_sane_where_digits_are_few(fleet, sensors):
     fixes = abs(off(recording.gnss, fleet)).max()
     for name in COOPERATIVE:
         track = METHODS[name]("nominal")(recording, [0])
-        away = abs(off(track.x, fleet)).max()
-        assert away < 5.0 * fixes + 5.0 * min(sensors.range_std, 1.0), name
+        assert abs(off(track.x, fleet)).max() < 5.0 * fixes + 5.0 * min(sensors.range_std, 1.0), name
         if track.covariance is not None:
             size = abs(track.covariance).max(axis=(-1, -2), keepdims=True)
             assert abs(track.covariance - track.covariance.mT).max() <= 1e-9 * size.max(), name
@@ -185,8 +184,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain():
         position = np.append(rng.uniform(-20, 20, (4, 2)), np.zeros((4, 1)), 1) + np.cumsum(velocity / 10, 0)
         sensors = co.Sensors((1.5, 1.5, 1.5), range_std=1e-3)
         fleet = co.Fleet(tuple("abcd"), t, position, velocity)
-        seen = co.observe(fleet, sensors, co.V2X(5, radius=200.0), runs=3, seed=seed)
-        drives.append((fleet, without_azimuth(seen)))
+        drives.append((fleet, without_azimuth(co.observe(fleet, sensors, co.V2X(5, radius=200.0), runs=3, seed=seed))))
     error = errors_of("kalman joint lkf-sa-edge batch-smoother", "no azimuth put what is", drives)
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 

@@ -36,8 +36,7 @@ def drive(every: int, std: float, most: int = 0, act: float = 1.0) -> tuple[Reco
     """A minute in town with a fix at every so many steps, and the truth."""
     town = co.load_fleet("town10").between(0, STEPS)
     stated = replace(S2, gnss_std=(std,) * 3)
-    acting = replace(stated, gnss_std=(act * std,) * 3)
-    seen = observe(town, acting, V2X(most), runs=2, observers=EGOS, assumed=stated)
+    seen = observe(town, replace(stated, gnss_std=(act * std,) * 3), V2X(most), runs=2, observers=EGOS, assumed=stated)
     return slow_fixes(seen, every), town.position[:, EGOS]
 
 

@@ -49,8 +49,7 @@ def linear() -> Problem:
 def bounded() -> Problem:
     """The linear case with a height that must not fall below what it would."""
     free = linear()
-    low = solve(free).position[:, 2].min() + 0.8
-    return free.constrain("position", free.names, [[-np.inf, -np.inf, low]] * 8)
+    return free.constrain("position", free.names, [[-np.inf, -np.inf, solve(free).position[:, 2].min() + 0.8]] * 8)
 
 
 CASES: dict[str, Callable[[], Problem]] = {
@@ -116,10 +115,10 @@ def test_a_tight_relaxation_is_near_before_it_is_refined(name):
         assert found.x == pytest.approx(ours.x, abs=2e-2)
 
 
-NO_FIX = Problem("abc").add("range", [AB, ("b", "c")], [[5.0], [6.0]], std=1.0)
-APART = Problem("abcd").add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+NO_FIX = Problem([*"abc"]).add("range", [AB, ("b", "c")], [[5.0], [6.0]], std=1.0)
+APART = Problem([*"abcd"]).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
 DETACHED = APART.add("displacement", [AB, ("c", "d")], [[4, 0, 0], [1, 0, 0]], std=1.0)
-ONE_PLACE = Problem("ab", x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
+ONE_PLACE = Problem([*"ab"], x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "truncated"])

@@ -137,7 +137,7 @@ def test_a_missing_library_says_how_to_install_it(monkeypatch, dense, backend):
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
 def test_a_point_that_an_infinite_std_leaves_free_is_named(backend):
     """Its weighted fixes are by hand: the mean of 0 and 4."""
-    problem = Problem("ab").add("position", "a", [[0, 0, 0]], std=1.0).add("position", "a", [4, 4, 4], std=1.0)
+    problem = Problem([*"ab"]).add("position", "a", [[0, 0, 0]], std=1.0).add("position", "a", [4, 4, 4], std=1.0)
     held, free = (solve(problem.add("position", "b", [4, 4, 4], std=s), backend, throw=False) for s in (1.0, np.inf))
     assert (held.status is Status.SOLVED, free.status is Status.SOLVED) == (True, False)
     assert held.x == pytest.approx(np.array([[2.0] * 3, [4.0] * 3]))

@@ -76,8 +76,7 @@ def test_check_solves_one_problem_with_every_backend(capsys, monkeypatch):
 
 def test_the_example_draws_a_graph_file(tmp_path):
     picture, script = tmp_path / "drive.png", ROOT / "examples" / "graph_file.py"
-    command = [sys.executable, "-W", "error", script, measured("mrclam5a.pyfg"), picture]
-    out = ran(command, check=True).stdout
+    out = ran([sys.executable, "-W", "error", script, measured("mrclam5a.pyfg"), picture], check=True).stdout
     assert "-> 69.10 in" in out
     assert "-> 0.214 m" in out
     assert picture.stat().st_size > 10_000

@@ -74,8 +74,7 @@ def test_a_fix_on_a_plane_is_projected(seed):
     rng = default_rng(seed)
     n, p, c, std = rng.normal(size=3), rng.normal(size=3) * 5, rng.normal(), rng.uniform(1, 4, 3)
     S = np.diag(std**2)
-    problem = Problem("a").add("position", "a", p, std=std).constrain("plane", "a", c, c, constants=n)
-    solution = solved(problem)
+    solution = solved(Problem([*"a"]).add("position", "a", p, std=std).constrain("plane", "a", c, c, constants=n))
     assert solution.x[0] == pytest.approx(p - S @ n * (n @ p - c) / (n @ S @ n), abs=1e-9)
     assert solution.covariance[0] == pytest.approx(S - np.outer(S @ n, S @ n) / (n @ S @ n), abs=1e-9)
     assert solution.cost == pytest.approx(0.5 * (n @ p - c) ** 2 / (n @ S @ n), rel=1e-9)
@@ -168,8 +167,7 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
 
     def speed_slope(flat):
         gap = (ties @ flat).reshape(-1, 3)
-        unit = gap / norm(gap, axis=1, keepdims=True)
-        return np.einsum("kc,kcn->kn", unit, ties.reshape(-1, 3, 3 * n)) / 0.5
+        return np.einsum("kc,kcn->kn", gap / norm(gap, axis=1, keepdims=True), ties.reshape(-1, 3, 3 * n)) / 0.5
 
     lane = np.eye(3 * n)[1::3]
     constraints = [
@@ -375,8 +373,7 @@ def test_a_claim_is_verified_independently_of_the_solver(claim, status):
         lambda problem, x: SolverResult(np.array(claim, float), 1),
         capabilities=Capabilities(constraints="linear"),
     )
-    problem = PAIR.constrain("position", "a", upper=[5, INF, INF])
-    assert solve(problem, claims, throw=False).status is status
+    assert solve(PAIR.constrain("position", "a", upper=[5, INF, INF]), claims, throw=False).status is status
 
 
 @pytest.mark.parametrize("loss", [None, Loss("cauchy", 2.0)])

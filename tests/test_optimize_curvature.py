@@ -15,7 +15,7 @@ from coopoc.optimize.starts import race
 def tangle(seed: int) -> Problem:
     """Every nonlinear kind, measured far from where the points are: curvature of either sign."""
     rng = np.random.default_rng(seed)
-    problem = Problem("abcd", x0=rng.normal(size=(4, 3)) * 10)
+    problem = Problem([*"abcd"], x0=rng.normal(size=(4, 3)) * 10)
     problem = problem.add("position", list("abcd"), problem.x0, std=rng.uniform(2, 6))
     problem = problem.add("range", [("a", "b"), ("c", "d")], rng.uniform(5, 30, (2, 1)), std=2.0)
     problem = problem.add("spherical", ("b", "c"), [rng.uniform(5, 30), 0.3, 1.4], std=[3.0, 0.6, 0.6])
@@ -39,7 +39,7 @@ def test_the_sign_of_the_curvature_is_that_of_casadis_hessian():
 def test_a_saddle_is_not_solved(backend):
     """An ego whose fix lies on the line of 10 m between two others, which are both 10 m away: it stands beside it."""
     fixes, stds = [[0, 0, 0], [-5, 0, 0], [5, 0, 0]], np.outer([10, 0.1, 0.1], np.ones(3))
-    problem = Problem("cab").add("position", range(3), fixes, std=stds)
+    problem = Problem([*"cab"]).add("position", range(3), fixes, std=stds)
     problem = problem.add("range", [(0, 1), (0, 2)], [10.0, 10.0], std=0.5)
     freely = solve(problem, backend)  # without an x0 its start is left, to one side or the other
     assert freely.notes[0] == race.ELSEWHERE

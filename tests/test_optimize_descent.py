@@ -16,7 +16,7 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes():
     across it, so that no step helps below that damping. Closed form: straight above, and the range's share of the
     height is its information's."""
     z = np.array([9.0, 9.5])
-    problem = Problem("av", dimension=2, x0=[[0, 0], [0.05, 10]], fixed=(0,))
+    problem = Problem([*"av"], dimension=2, x0=[[0, 0], [0.05, 10]], fixed=(0,))
     problem = problem.add("position", "v", [0.0, 10.0], std=[1e3, 1e-3])
     found = [solve(problem.add("range", ("a", "v"), length, std=1.0)).x[1] for length in z]
     assert np.array(found) == pytest.approx(np.c_[0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)], abs=1e-6)
@@ -24,7 +24,7 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes():
 
 def test_a_slope_that_bends_away_is_followed():
     """From the far side of a ring, where J^T J is a thousand times the curvature, which is negative: FAILED before."""
-    problem = Problem("ar", dimension=2, x0=[[0, 0], [10, 0.1]], fixed=(0,)).add("range", (0, 1), 10.0, std=0.1)
+    problem = Problem([*"ar"], dimension=2, x0=[[0, 0], [10, 0.1]], fixed=(0,)).add("range", (0, 1), 10.0, std=0.1)
     found = solve(problem.add("position", "r", [-0.01, 0.0], std=1.0))
     assert found.x[1] == pytest.approx([-1000.01 / 101, 0.0], abs=1e-6)
 
@@ -54,7 +54,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
 
 def ranged() -> Problem:
     x0 = np.array([[0.0, 0], [9, 0], [0, 9], [5, 5]])
-    problem = Problem("abcx", x0=x0, dimension=2).add("position", list("abc"), x0[:3], 1e-3)
+    problem = Problem([*"abcx"], x0=x0, dimension=2).add("position", list("abc"), x0[:3], 1e-3)
     return problem.add("range", [("x", name) for name in "abc"], norm(x0[:3] - [3.0, 4.0], axis=1), 0.1)
 
 

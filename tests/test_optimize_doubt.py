@@ -47,7 +47,7 @@ def test_a_cost_that_the_noise_does_not_explain_is_noted():
 
 @pytest.mark.parametrize("noise", [{"std": [inf, inf, 0.1]}, {"sqrt_information": 10 * np.eye(3)[[2, 2, 2]] / 3**0.5}])
 def test_what_is_not_measured_is_no_number(noise):
-    heights = Problem("a").add("position", "a", [0, 0, 0], std=[1.0, 1.0, inf])
+    heights = Problem([*"a"]).add("position", "a", [0, 0, 0], std=[1.0, 1.0, inf])
     heights = heights.add("position", ["a"] * 100, np.zeros((100, 3)), **noise)
     assert solve(heights).expected == pytest.approx(99 / 2)
 
@@ -66,8 +66,7 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
         load_graph(file)
     own, axes = eigh([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
     nearest = axes * np.maximum(own, 0.0) @ axes.T
-    read = inv(load_graph(file, repair=True).relative_pose.covariance[1])
-    assert read == pytest.approx(nearest, abs=1e-4)
+    assert inv(load_graph(file, repair=True).relative_pose.covariance[1]) == pytest.approx(nearest, abs=1e-4)
     with pytest.raises(SystemExit):
         main(["solve", str(file), "--repair"])
     out, err = capsys.readouterr()
@@ -103,7 +102,7 @@ def test_covariances_of_many_nodes_are_computed_where_asked():
 
 def test_anchors_among_poses_and_constraints_without_a_backend():
     with refused(r"anchors.*co.pose\(anchor, 0\)"):
-        Problem("al", x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses="a")
+        Problem([*"al"], x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses=[*"a"])
     for kind, nodes, backend in (("displacement", ("a", "b"), "osqp"), ("range", ("a", "b"), "casadi")):
         found = solve(PAIR.constrain(kind, nodes, upper=[7, 9, 9] if kind == "displacement" else 7.0))
         assert (found.backend, found.x[1, 0] - found.x[0, 0]) == (backend, pytest.approx(7.0, abs=1e-6))

@@ -127,7 +127,7 @@ def test_a_formula_that_casadi_cannot_run_is_refused():
         return (0.5 * np.hypot(float(dx), dy),)
 
     try:
-        problem = Problem("ab", x0=np.eye(2), dimension=2).add("half_range_of_test", ("a", "b"), 1.0, std=0.1)
+        problem = Problem([*"ab"], x0=np.eye(2), dimension=2).add("half_range_of_test", ("a", "b"), 1.0, std=0.1)
         with refused(r"half_range_of_test.*namespace m"):
             solve(problem)
     finally:

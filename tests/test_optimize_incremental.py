@@ -19,8 +19,7 @@ def measured() -> tuple[list[gtsam.Pose2], list[tuple[int, str, float]]]:
     """Odometry, and the landmark that each pose ranges."""
     rng = np.random.default_rng(3)
     moved = [a.between(b).compose(gtsam.Pose2(*(STD * rng.normal(size=3)))) for a, b in pairwise(TRUE)]
-    far = [(k, f"l{k % 2}", TRUE[k].range(MARKS[f"l{k % 2}"]) + 0.1 * rng.normal()) for k in range(1, 25)]
-    return moved, far
+    return moved, [(k, f"l{k % 2}", TRUE[k].range(MARKS[f"l{k % 2}"]) + 0.1 * rng.normal()) for k in range(1, 25)]
 
 
 def our_pose(pose: gtsam.Pose2) -> np.ndarray:
@@ -94,7 +93,7 @@ def test_marginals_are_gtsams_in_the_worlds_directions():
 @pytest.mark.parametrize(("z", "std"), [([5e5, 5e6], 3.0), ([20.0, 0.0], 300.0)])
 def test_a_guess_has_no_weight(z, std):
     """Closed form: the fix itself."""
-    live = co.incremental(co.Problem("a", dimension=2, x0=np.zeros((1, 2))).add("position", "a", z, std=std))
+    live = co.incremental(co.Problem([*"a"], dimension=2, x0=np.zeros((1, 2))).add("position", "a", z, std=std))
     assert live["a"] == pytest.approx(z, rel=1e-6, abs=1e-4)
     assert live.marginal("a").diagonal() == pytest.approx(std**2, rel=1e-6)
 
@@ -150,7 +149,7 @@ def test_what_is_refused_leaves_the_estimate_as_it_was():
         with refused(field):
             live.add(factors, values)
     assert (live.x == before).all()
-    problem = co.Problem("a", dimension=2).add("position", "a", [0, 0], std=1.0)
+    problem = co.Problem([*"a"], dimension=2).add("position", "a", [0, 0], std=1.0)
     with refused("1 constraints"):
         co.incremental(problem.constrain("position", "a", lower=0.0))
     with refused("params"):

@@ -101,12 +101,11 @@ def test_the_logarithm_of_a_relative_pose_is_scipys(far):
 
 def test_angles_wrap():
     """A bearing measured just beyond -x from a point just before it is a small residual, whatever the turn."""
-    problem = Problem("ab").add("azimuth", ("a", "b"), np.pi - 0.01, std=1.0)
+    problem = Problem([*"ab"]).add("azimuth", ("a", "b"), np.pi - 0.01, std=1.0)
     x = np.array([[0, 0, 0], [-10.0, -0.1, 0]])
     residual, _ = problem.whiten(x)
     assert residual[0] == pytest.approx(0.02, abs=1e-4)
-    same = Problem("ab").add("azimuth", ("a", "b"), -np.pi - 0.01, std=1.0)
-    assert same.whiten(x)[0] == pytest.approx(residual)
+    assert Problem([*"ab"]).add("azimuth", ("a", "b"), -np.pi - 0.01, std=1.0).whiten(x)[0] == pytest.approx(residual)
 
 
 def test_a_wrong_frame_and_a_name_that_is_taken_are_named():

@@ -81,7 +81,7 @@ def test_predictions_are_those_of_dense_algebra():
 
 def test_points_join_as_poses_do():
     """Closed form: of two fixes beside a known one the near one fits, and the mean of both is the answer."""
-    problem = Problem("a").add("position", "a", [0, 0, 0], std=1.0)
+    problem = Problem([*"a"]).add("position", "a", [0, 0, 0], std=1.0)
     problem = problem.add("position", ["a", "a"], [[1.0, 0, 0], [50, 0, 0]], cov=np.eye(3))
     solution = solve_gnc(problem, [1])
     np.testing.assert_allclose(solution.x[0], [0.5, 0, 0], atol=1e-9)
@@ -117,8 +117,7 @@ def judged(graph: Graph, bad: Bools) -> tuple[co.Solution, list[int], list[float
     """The answer where nothing says where any robot begins, how many wrong ones it keeps and right ones it loses, and
     the error m of it and of that of the right ones alone."""
     solution, rows, rejected = from_known(lost(graph))
-    right = kept(graph.relative_pose, ~bad)
-    clean = co.solve(from_graph(lost(replace(graph, relative_pose=right)), start="tree"))
+    clean = co.solve(from_graph(lost(replace(graph, relative_pose=kept(graph.relative_pose, ~bad))), start="tree"))
     counts = [int(each.sum()) for each in (bad[rows] & ~rejected, ~bad[rows] & rejected)]
     return solution, counts, [alignment_error(x, graph.position) for x in (solution.position, clean.position)]
 

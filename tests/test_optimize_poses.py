@@ -115,13 +115,13 @@ def test_exp_and_log_are_scipys():
 
 def test_full_covariances_weigh_as_their_inverse():
     cov = np.array([[4.0, 1.0, 0], [1.0, 2.0, 0.5], [0, 0.5, 3.0]])
-    problem = Problem("a").add("position", "a", [1.0, 2, 3], cov=cov)
+    problem = Problem([*"a"]).add("position", "a", [1.0, 2, 3], cov=cov)
     gap = np.array([1.0, -2.0, 0.5])
     assert problem.cost(gap[None] + [1, 2, 3]) == pytest.approx(0.5 * gap @ np.linalg.solve(cov, gap))
     assert solve(problem).covariance[0] == pytest.approx(cov)
 
 
-PLANE = Problem("ab", dimension=2, poses="a")
+PLANE = Problem([*"ab"], dimension=2, poses=[*"a"])
 WRONG = {
     "no pose": (lambda: PLANE.add("bearing", ("b", "a"), 0.1, std=0.1), "must be a pose"),
     "space in the plane": (lambda: PLANE.add("position", "a", [0, 0, 0], std=1.0), "must fit a problem of 2"),
@@ -131,8 +131,8 @@ WRONG = {
     "not positive": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [2, 1]]), "symmetric positive definite"),
     "not symmetric": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [0, 9]]), "not symmetric"),
     "no dt": (lambda: PLANE.add("speed", AB, 10.0, std=0.1), "1 finite numbers for speed"),
-    "held nowhere": (lambda: Problem("a", fixed="a"), "needs an x0"),
-    "four dimensions": (lambda: Problem("a", dimension=4), "must be 2 or 3"),
+    "held nowhere": (lambda: Problem([*"a"], fixed=[*"a"]), "needs an x0"),
+    "four dimensions": (lambda: Problem([*"a"], dimension=4), "must be 2 or 3"),
 }
 
 
@@ -175,8 +175,7 @@ def test_mrclam5a_reaches_the_reference():
 
 def test_a_graph_without_its_gauge_names_what_is_free():
     problem = from_graph(load_graph(measured("factor_graph_small.pyfg")))
-    loose = Problem(problem.names, problem.factors, problem.x0, dimension=2, poses=problem.poses)
-    found = solve(loose, throw=False)
+    found = solve(Problem(problem.names, problem.factors, problem.x0, dimension=2, poses=problem.poses), throw=False)
     assert found.status is Status.RANK_DEFICIENT
     assert set(found.unobservable) == set(problem.names)
 
@@ -230,18 +229,18 @@ def test_what_no_start_knows_is_drawn():
 
 @DESCENTS
 def test_points_that_a_pose_sees_in_the_world_do_not_start_in_one_place(backend):
-    seen = Problem("pab", dimension=2, poses=(0,)).add("pose", 0, pose([0, 0], 0), std=0.1)
+    seen = Problem([*"pab"], dimension=2, poses=(0,)).add("pose", 0, pose([0, 0], 0), std=0.1)
     seen = seen.add("spherical", [(0, 1), (1, 2), (0, 2)], [[5.0, 0.3], [4.0, 1.2], [8.11, 0.697]], std=[0.1, 0.02])
     assert solve(seen, backend).cost < 0.01
 
 
 def test_half_a_turn_is_told_from_places_that_coincide():
-    one = Problem("a", poses=(0,), x0=[pose([0, 0, 0], [0, 0, 0])]).add(
+    one = Problem([*"a"], poses=(0,), x0=[pose([0, 0, 0], [0, 0, 0])]).add(
         "pose", 0, pose([0, 0, 0], [0, np.pi, 0]), std=0.1
     )
     with refused("a half a turn from the measured rotation"):
         solve(one)
-    assert solve(Problem("a", one.factors, poses=(0,))).cost < 1e-9
+    assert solve(Problem([*"a"], one.factors, poses=(0,))).cost < 1e-9
 
 
 def test_an_antenna_stands_at_the_end_of_its_arm():

@@ -30,7 +30,7 @@ def recording(crossing):
 def mixed() -> Problem:
     """One factor of every kind, with std per component, per row and a full root."""
     rng = default_rng(0)
-    p = Problem("abcd", x0=rng.normal(size=(4, 3)) * 10)
+    p = Problem([*"abcd"], x0=rng.normal(size=(4, 3)) * 10)
     p = p.add("position", list("abcd"), rng.normal(size=(4, 3)) * 10, std=rng.uniform(1, 3, (4, 3)))
     p = p.add("displacement", AB, [5, 1, 0], sqrt_information=np.tril(rng.uniform(0.5, 1, (3, 3))))
     p = p.add("spherical", [("a", "c"), ("d", "b")], [[9, 1, 1.5], [12, -3, 1.2]], std=[1, 0.07, 0.07])
@@ -69,8 +69,7 @@ def test_the_noise_model_sets_the_weights(recording):
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))
     x = default_rng(0).normal(size=(len(nominal.names), 3)) * 30
     assert stated.cost(x) == pytest.approx(nominal.cost(x), rel=1e-12)
-    unsure = replace(recording, motion_variance=np.full(recording.broadcasts.shape, 9.0))
-    more = Problem.from_window(unsure, 20, 0, 3)
+    more = Problem.from_window(replace(recording, motion_variance=np.full(recording.broadcasts.shape, 9.0)), 20, 0, 3)
     before, after = (next(f.std for f in each.factors if f.kind == "displacement") for each in (nominal, more))
     assert after**2 - before**2 == pytest.approx(9.0 * recording.dt)
     identity = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.identity())
@@ -111,12 +110,14 @@ BAD = {
     "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
     "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[inf]]), "must be finite"),
     "heights in a plane": (
-        lambda: Problem("ab", dimension=2).constrain("inclination", AB, 0.0, 1.0),
+        lambda: Problem([*"ab"], dimension=2).constrain("inclination", AB, 0.0, 1.0),
         "does not exist in two dimensions",
     ),
-    "no factor": (lambda: Problem("a", factors=(1,)), "must be Factors"),
+    "no factor": (lambda: Problem([*"a"], factors=(1,)), "must be Factors"),
     "nodes of a factor": (lambda: Factor("range", [[0]], [[5.0]], std=[[1.0]]), r"must have shape \(M, 2\) for range"),
-    "a factor of another problem": (lambda: Problem("a", factors=PAIR.factors), "one of a"),
+    "a factor of another problem": (lambda: Problem([*"a"], factors=PAIR.factors), "one of a"),
+    "infinite bounds": (lambda: PAIR.constrain("position", "a", [inf, 0, 0], inf), "below infinity"),
+    "a text for names": (lambda: Problem("ego"), "names = .ego.: must be a sequence"),
     "no bound": (lambda: PAIR.constrain("position", "a"), "must bound something"),
     "bounds of a pose": (lambda: PAIR.constrain("relative_pose", AB), "cannot bound them"),
     "a loss relaxed": (
@@ -125,13 +126,13 @@ BAD = {
     ),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
     "whole numbers for names": (lambda: Problem((2, 1)), r"names = .2, 1.: must be a sequence of texts"),
-    "twice a name": (lambda: Problem("baa"), r"\['a'\]: must be unique"),
+    "twice a name": (lambda: Problem([*"baa"]), r"\['a'\]: must be unique"),
     "x0": (lambda: Problem(AB, x0=np.zeros((3, 3))), "shape"),
-    "no factors": (lambda: solve(Problem("a")), "no measurements"),
+    "no factors": (lambda: solve(Problem([*"a"])), "no measurements"),
     "words for z": (lambda: PAIR.add("range", AB, "far", std=1.0), "array of numbers"),
     "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
     "shown": (lambda: Problem(AB, shown="c"), "node = .c.: must be one of a, b"),
-    "x0 not finite": (lambda: Problem("a", x0=[[nan, 0, 0]]), "x0 = not finite"),
+    "x0 not finite": (lambda: Problem([*"a"], x0=[[nan, 0, 0]]), "x0 = not finite"),
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
@@ -139,8 +140,8 @@ BAD = {
         lambda: solve(replace(PAIR, x0=np.zeros((2, 3))).constrain("range", AB, 4.0, 5.0)),
         "a and b coincide",
     ),
-    "nothing to relax": (lambda: quadratic(Problem("a")), "no measurements"),
-    "two runs": (lambda: Problem("a").add("position", "a", np.zeros((2, 1, 3)), std=1.0), "a problem for each run"),
+    "nothing to relax": (lambda: quadratic(Problem([*"a"])), "no measurements"),
+    "two runs": (lambda: Problem([*"a"]).add("position", "a", np.zeros((2, 1, 3)), std=1.0), "a problem for each run"),
 }
 
 
@@ -204,7 +205,7 @@ def test_a_start_is_the_least_squares_of_the_converted_vectors(recording):
 def test_fine_measurements_do_not_hide_what_is_free():
     """What rounding leaves of J^T J along a free direction looks like a variance of 1e-8 m^2."""
     for fine in default_rng(0).uniform(1e-4, 2e-4, (60, 3, 3)):
-        free = Problem("ab").add("displacement", [(0, 1)] * 3, fine, std=fine)
+        free = Problem([*"ab"]).add("displacement", [(0, 1)] * 3, fine, std=fine)
         assert solve(free, throw=False).status is Status.RANK_DEFICIENT
 
 
@@ -214,7 +215,7 @@ def test_a_point_that_can_turn_around_another_is_free(backend):
     rng = default_rng(0)
     for _ in range(20):
         x0 = np.concatenate([[[0, 0, 0], [9, 0, 0]], rng.normal(0, 9, (1, 3))])
-        hanging = Problem("abc", PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
+        hanging = Problem([*"abc"], PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
         bounded = hanging.constrain("position", "a", upper=50.0) if backend == "osqp" else hanging
         solution = solve(bounded, backend, throw=False)
         assert solution.status is Status.RANK_DEFICIENT
@@ -224,8 +225,7 @@ def test_a_point_that_can_turn_around_another_is_free(backend):
 @pytest.fixture(scope="module")
 def incomplete():
     """Half of the fixes are missing; of the relative measurements some all, some the azimuth, some the range."""
-    fleet = load_fleet("town10").between(0, 30)
-    seen = observe(fleet, Sensors.paper_scenario2(), V2X(6), runs=4, observers=[5])
+    seen = observe(load_fleet("town10").between(0, 30), Sensors.paper_scenario2(), V2X(6), runs=4, observers=[5])
     rng = default_rng(0)
     gnss, relative = seen.gnss.copy(), seen.relative.copy()
     gnss[rng.random(gnss.shape[:3]) < 0.5] = nan
@@ -271,6 +271,6 @@ def test_what_is_missing_is_no_factor(incomplete, noise):
 @pytest.mark.parametrize("poses", [(), (1,), (0, 2)])
 def test_a_point_among_poses_has_no_rotation_to_move(poses):
     x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
-    problem = Problem("abc", x0=x0, dimension=2, poses=poses)
+    problem = Problem([*"abc"], x0=x0, dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)
     assert problem.movable.sum(axis=1).tolist() == wanted.tolist()

@@ -53,8 +53,7 @@ def observed(name: str, seed: int) -> Problem:
     rng = default_rng(seed)
     anchors = np.array([[0, 0, 0], [30, 0, 2], [0, 30, 4], [30, 30, 9.0]])
     truth = rng.uniform(8, 22, (2, 3)) * [1, 1, 0.5]
-    x0 = np.concatenate([anchors, truth + rng.normal(0, 0.5, (2, 3))])
-    problem = Problem("abcdpq", x0=x0, fixed="abcd")
+    problem = Problem([*"abcdpq"], x0=np.concatenate([anchors, truth + rng.normal(0, 0.5, (2, 3))]), fixed=[*"abcd"])
     pairs = [(a, 4 + p) for a in range(4) for p in range(2)] + [(4, 5)]
     vector = np.array([[*anchors, *truth][j] - [*anchors, *truth][i] for i, j in pairs])
     for kind, std in (("range", 0.3), ("azimuth", 0.03), ("inclination", 0.03)):

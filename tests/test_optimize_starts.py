@@ -61,8 +61,7 @@ def test_ranges_that_are_eased_lead_from_bad_odometry():
     w, rng = world(2, 2, 2, 250), default_rng(2)
     pairs = np.sort(rng.integers(0, 500, (500, 2)), axis=1)
     moved = w.relative(w.chain(), 0.3, 0.15)
-    graph = w.graph(relative_pose=moved, ranges=w.ranged(pairs[pairs[:, 0] < pairs[:, 1]], 0.2))
-    truth, found = beside(graph)
+    truth, found = beside(w.graph(relative_pose=moved, ranges=w.ranged(pairs[pairs[:, 0] < pairs[:, 1]], 0.2)))
     assert found.extras["start"] == "eased"
     assert found.cost <= truth.cost * (1 + 1e-6)
     assert "may be the truth" in truth.notes[0]
@@ -83,7 +82,7 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
         std, z = 0.3 if many == 3 else 6.0, norm(apart, axis=1) + 0.2 * rng.normal(size=15)
         fixes = truth[:many] + std * rng.normal(size=(many, 3))
         fixes[-1] += 100.0 * (case == "a wrong fix")
-        problem = Problem("abcdefo"[:nodes]).add("position", range(many), fixes, std=std, loss=loss)
+        problem = Problem([*"abcdefo"][:nodes]).add("position", range(many), fixes, std=std, loss=loss)
         pairs = np.c_[i, j, np.full(15, 6)]
         if case == "an offset":
             problem = problem.add("position", [6], [[0, 0, 0]], std=[90.0, 1.0, 1.0])
@@ -109,7 +108,7 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
 def test_exact_ranges_end_at_the_truth_without_a_word():
     truth = default_rng(0).uniform(0, 100, (8, 3))
     pairs = np.column_stack(np.triu_indices(8, 1))
-    problem = Problem("abcdefgh").add("position", range(5), truth[:5], std=0.1)
+    problem = Problem([*"abcdefgh"]).add("position", range(5), truth[:5], std=0.1)
     z = norm(np.diff(truth[pairs], axis=1), axis=(1, 2))
     problem = problem.add("range", pairs, z, std=0.1)
     found = solve(problem)
@@ -153,7 +152,7 @@ def test_rejecting_a_quarter_is_doubtful():
     """Closed form: of 8 fixes of a point 3 are 50 m off."""
     z = np.zeros((8, 3))
     z[:3] = 50.0
-    problem = Problem("a").add("position", ["a"] * 8, z + 1e-3 * np.arange(24).reshape(8, 3), std=1.0)
+    problem = Problem([*"a"]).add("position", ["a"] * 8, z + 1e-3 * np.arange(24).reshape(8, 3), std=1.0)
     assert solve_gnc(problem, [0]).notes[0].startswith("DOUBTFUL: GNC rejects 3 of 8 candidates")
 
 
@@ -237,7 +236,7 @@ def test_points_with_vague_fixes_are_mirrored_together():
     """Closed form: fixes prefer the other side of the line through two towers by 10 / 81."""
     pairs, x = np.array([(0, 2), (1, 2), (0, 3), (1, 3), (2, 3)]), np.array([[0, 0], [9, 0], [4, 3], [6, 2.0]])
     apart = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
-    problem = Problem("abcd", x0=x, dimension=2, fixed="ab").add("position", [2, 3], [[4, -1], [6, -1]], std=9.0)
+    problem = Problem([*"abcd"], x0=x, dimension=2, fixed=[*"ab"]).add("position", [2, 3], [[4, -1], [6, -1]], std=9.0)
     problem = problem.add("range", pairs, apart, std=0.01)
     assert "minimum costs 0.123 less" in str(solve(problem).notes)
 

@@ -26,6 +26,11 @@ def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float | Floats) 
     return problem.add("range", [(k, "r") for k in range(count)], ranges, std=std)
 
 
+def test_fixed_nodes_are_at_no_local_minimum():
+    problem = ranged(np.zeros((1, 2)), np.ones(2), np.array([9.0]), 1.0)
+    assert "local" not in solve(replace(problem, fixed=(0, 1))).notes[0]
+
+
 @DESCENTS
 @pytest.mark.parametrize(("z", "std"), [(1e308, 1.0), (1.0, 1e-160)])
 def test_an_infinite_cost_is_no_minimum(z, std, backend):
@@ -89,7 +94,7 @@ def test_a_saddle_between_two_anchors_is_one():
 @pytest.mark.parametrize(("toward", "why"), [([2.4, 0.7], "r went .* m away"), ([-1.0, 1.6, 1.6], "b and r nearly")])
 def test_an_end_that_is_no_minimum_says_why(toward, why):
     """Azimuths that part meet nowhere; of three two are met above an anchor, and the third below it."""
-    problem = Problem("abcr", x0=[*ANCHORS, [10, -10], [11, 2]], dimension=2, fixed=range(3))
+    problem = Problem([*"abcr"], x0=[*ANCHORS, [10, -10], [11, 2]], dimension=2, fixed=range(3))
     found = solve(problem.add("azimuth", [(k, 3) for k in range(len(toward))], toward, std=0.1), throw=False)
     assert re.search(why, str(found))
 
@@ -103,7 +108,7 @@ def test_ranges_that_do_not_meet_are_noted():
 
 @pytest.mark.parametrize("std", [1e-5, 1e-6])
 def test_odometry_of_micrometres_beside_a_fix_of_a_metre_is_known(std):
-    problem = Problem("abc").add("position", ["a", "c"], [[0, 0, 0], [2, 1, 0]], std=1.0)
+    problem = Problem([*"abc"]).add("position", ["a", "c"], [[0, 0, 0], [2, 1, 0]], std=1.0)
     found = solve(problem.add("displacement", [(0, 1), (1, 2)], [[1, 0, 0], [1, 0, 0]], std=std))
     assert found.covariance[1].diagonal() == pytest.approx(0.5, rel=1e-3)
 
@@ -116,7 +121,7 @@ def test_a_certified_mirror_image_is_not_unique():
     fixed = pair.add("position", "r", [5, 5], std=1.0)
     verdict = certify(fixed, solve(fixed))
     assert (verdict.certified, verdict.unique) == (True, True)
-    free = Problem("abc", dimension=2, x0=[[0, 0], [3, 0], [3, 4]]).add("range", (0, 2), 5.2, std=0.1)
+    free = Problem([*"abc"], dimension=2, x0=[[0, 0], [3, 0], [3, 4]]).add("range", (0, 2), 5.2, std=0.1)
     free = free.add("displacement", [(0, 1), (1, 2)], [[3.0, 0.1], [0.1, 4.0]], std=0.2)
     verdict = certify(free, solve(free, throw=False))
     assert (verdict.certified, verdict.unique) == (True, False)
@@ -145,7 +150,7 @@ def test_a_lower_bound_is_below_the_cost(seed):
 
 
 def held(lower: float) -> Solution:
-    return solve(Problem("a").add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
+    return solve(Problem([*"a"]).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
 
 
 def test_bounds_that_push_are_no_local_minimum():
@@ -158,10 +163,10 @@ def test_bounds_that_push_are_no_local_minimum():
 
 
 def test_a_convex_problem_has_no_local_minimum():
-    apart = Problem("ab", dimension=2).add("position", ["a", "b"], [[0, 0], [10, 0]], std=0.5)
+    apart = Problem([*"ab"], dimension=2).add("position", ["a", "b"], [[0, 0], [10, 0]], std=0.5)
     apart = apart.constrain("displacement", ("a", "b"), lower=[4.0, 0], upper=[4.0, 0])
     assert "explains 1 +- 1: constraints of displacement that contradict" in solve(apart).notes[-1]
-    free = Problem("abc", dimension=2).add("displacement", [(0, 1), (1, 2), (0, 2)], [[1, 0], [1, 0], [2.1, 0]], 0.1)
+    free = Problem([*"abc"], dimension=2).add("displacement", [(0, 1), (1, 2), (0, 2)], [[1, 0], [1, 0], [2.1, 0]], 0.1)
     assert solve(free, throw=False).cost == pytest.approx(0.1**2 / 6 / 0.1**2)
 
 

@@ -127,8 +127,7 @@ def test_draws_are_keyed_by_what_they_belong_to(crossing):
     assert np.array_equal(shorter.velocity, base.velocity[:2, :30])
     few = observe(crossing, replace(S2, outliers=ALL), V2X(max_neighbours=2), runs=5)
     assert np.array_equal(few.relative, base.relative[:, among(base.links, few.links)])
-    only = seen(crossing, Outliers(ranges=ALL.ranges), runs=5)
-    assert np.array_equal(only.relative[..., 0], base.relative[..., 0])
+    assert np.array_equal(seen(crossing, Outliers(ranges=ALL.ranges), runs=5).relative[..., 0], base.relative[..., 0])
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])

@@ -111,7 +111,6 @@ def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing):
 
 
 def test_nominal_knowledge_adds_the_heading_to_the_azimuth():
-    both = replace(NOISE, heading_bias_std=0.12, azimuth_std=0.0)
-    known = NoiseModel.nominal(replace(both, azimuth_std=1e-12))
+    known = NoiseModel.nominal(replace(replace(NOISE, heading_bias_std=0.12, azimuth_std=0.0), azimuth_std=1e-12))
     assert known.sensors.azimuth_std == pytest.approx(0.13)
     assert NoiseModel.nominal(Sensors()).sensors == Sensors()

@@ -174,5 +174,4 @@ def test_mistakes_of_streams_are_named(make, words):
 def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path):
     """numba's bounds checks, over members that come and go, in a process of its own."""
     words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
-    env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    python(*words, env=env, cwd=ROOT)
+    python(*words, env={**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}, cwd=ROOT)

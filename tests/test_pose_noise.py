@@ -35,8 +35,7 @@ def test_noise_that_acts_is_learned_from_a_wrong_start():
     task = PoseTask(observed(fleet, acting, runs=12), fleet, fleet.ids, method, 20)
 
     def score(assumed):
-        track = replace(method, assumed=assumed)(task.recording, fleet.ids)
-        return float(log_score(track, fleet)[:, 20:].mean())
+        return float(log_score(replace(method, assumed=assumed)(task.recording, fleet.ids), fleet)[:, 20:].mean())
 
     learned = fit_pose_noise([task], wrong, evaluations=120)
     assert score(wrong) < score(acting) - 0.3

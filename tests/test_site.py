@@ -16,8 +16,7 @@ def test_every_page_has_a_place():
 
 def test_every_study_has_a_finding_and_a_page_that_is_there():
     pytest.importorskip("mkdocs", reason="make docs installs it")
-    code = "import pages; print(len(pages.names('coopoc.studies')), pages._gallery())"
-    out = python("-c", code, cwd=ROOT / "docs")
+    out = python("-c", "import pages; print(len(pages.names('coopoc.studies')), pages._gallery())", cwd=ROOT / "docs")
     title, *studies = out.split("\n## ")
     for study in studies:
         assert "**" in study, study
@@ -28,8 +27,7 @@ def test_every_study_has_a_finding_and_a_page_that_is_there():
 
 
 def test_figures_fit_a_phone_and_lines_of_code_stay_whole():
-    css = (ROOT / "docs" / "site.css").read_text()
-    assert not re.search(r"pre-wrap|img[^}]*max-width: none", css)
+    assert not re.search(r"pre-wrap|img[^}]*max-width: none", (ROOT / "docs" / "site.css").read_text())
     template = (ROOT / "coopoc" / "study" / "report.html.j2").read_text()
     assert all('class="wide"' in line for line in template.splitlines() if "{{ plot(" in line)
 

@@ -70,8 +70,7 @@ def known_of(method: Any, recording: Recording) -> NoiseModel:
 
 def by_joint(method: JointFilter, recording: Recording, stars: Any) -> Any:
     known = known_of(method, recording)
-    exact = method.exact and known.exact_relative
-    return joint.follow(stars, partial_of(joint.update, noise_model=known, exact=exact))
+    return joint.follow(stars, partial_of(joint.update, noise_model=known, exact=method.exact and known.exact_relative))
 
 
 def by_lkf(method: LKFSA, recording: Recording, stars: Any) -> Any:

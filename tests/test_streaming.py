@@ -135,8 +135,7 @@ def window(draw: Generator, steps: int, late: int, q: float, r: float) -> tuple[
         without, _ = prompt.step(None if stale else [fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1)
     rows = np.vstack([np.eye(steps + 1)[at] / r, np.diff(np.eye(steps + 1), axis=0) / q])
     best = lstsq(rows, np.concatenate([fixes / r, np.zeros(steps)]), rcond=None)[0][-1]
-    std = np.sqrt(inv(rows.T @ rows)[-1, -1])
-    return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], std
+    return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], np.sqrt(inv(rows.T @ rows)[-1, -1])
 
 
 def test_a_late_fix_is_nearly_used_up():

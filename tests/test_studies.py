@@ -135,8 +135,7 @@ def test_weights_of_another_training_are_refused(tmp_path):
     p = {**study("error_cdf", weights=str(tmp_path), train_seeds=1).settings, "method": "okf"}
     plant(tmp_path, "okf", p)
     assert weights.checkpoint("okf", p, 0).card["fleet"] == "town10-clients"
-    trained = drawn("error_cdf", pd.DataFrame({"method": ["okf"]}), **p)
-    assert " optimiser steps; " in weights.described(trained)["okf"]
+    assert " optimiser steps; " in weights.described(drawn("error_cdf", pd.DataFrame({"method": ["okf"]}), **p))["okf"]
     with refused(r"weights = .*okf-gnss-axis-0.*were trained otherwise"):
         weights.checkpoint("okf", {**p, "clients": "town04"}, 0)
 

@@ -108,7 +108,6 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight, short_town):
     (row,) = [row for row in rows(table) if row[0] == 200]
     found = [entry for entry in row if isinstance(entry, Interval)]
     assert [entry.mean for entry in found[:2]] == pytest.approx([error.mean() for error in errors])
-    gaps = [paired_difference(error, errors[0]) for error in errors[1:]]
-    for gap, wanted in zip(found[2:], gaps, strict=True):
+    for gap, wanted in zip(found[2:], [paired_difference(error, errors[0]) for error in errors[1:]], strict=True):
         assert [gap.mean, gap.low, gap.high] == pytest.approx([wanted.mean, wanted.low, wanted.high])
         assert gap.mean != 0.0

@@ -24,8 +24,7 @@ def test_side_by_side_takes_any_methods_and_conditions(tmp_path, short_town):
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
     results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,kalman,bound"})
     assert "Noise may explain the difference from" in published(tmp_path / "side_by_side")["findings"][-1]
-    caption = (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
-    assert "With latency_s 0.2, common_share 0.5." in caption
+    assert "With latency_s 0.2, common_share 0.5." in (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
     mild = run_study(
         "side_by_side", tmp_path / "mild", settings={**harsh, "method": "joint", "latency_s": None, "common_share": 0.0}
     )

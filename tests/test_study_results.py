@@ -68,6 +68,8 @@ def test_what_would_be_mixed_is_named(frame):
         found.summary(["method", "noise_model"], "rt_le_m")
     with refused(r"column = 'metod'.*Did you mean method\?"):
         found.summary(["metod"], "rt_le_m")
+    with refused("by = 'method': must be a sequence"):
+        found.summary("method", "rt_le_m")
     with refused(r"metric = 'rt_le'.*Did you mean rt_le_m\?"):
         found.interval("rt_le", method="gnss", k=0)
     with refused("k = 7: must be among 0, 4"):
@@ -190,8 +192,7 @@ def test_html_is_well_formed_and_escaped():
 
 def test_best_is_sought_among_methods_and_never_the_bound():
     rows = (("GNSS", 6.0, 5.0), ("KF", 1.0, 2.0), ("OKF", 1.001, 1.5), ("Oracle KF", 0.5, 0.5))
-    table = Table(("Method", "a", "b"), rows, "", best="min", along="column")
-    lines = table.to_markdown().splitlines()[2:]
+    lines = Table(("Method", "a", "b"), rows, "", best="min", along="column").to_markdown().splitlines()[2:]
     assert [line.count("**") for line in lines] == [0, 2, 4, 0]  # KF and OKF tie as shown
     assert Table(("K", "KF"), (("0", 1.0),), "", best="min").to_markdown().count("**") == 0
     assert "**6.00**" in Table(("Method", "a"), tuple(r[:2] for r in rows), "", "max", "column").to_markdown()

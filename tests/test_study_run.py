@@ -62,8 +62,7 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
 def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study, tmp_path):
     trouble = tmp_path / "trouble"
     trouble.write_text("exit")
-    changes = {"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"}
-    results = run_study(study, tmp_path, settings=changes)
+    results = run_study(study, tmp_path, settings={"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"})
     with refused("1 cells failed. SystemExit"):
         results.values("rt_le_m")
     assert set(views(tmp_path / "small")["missing"]) == {"rt_le", "findings"}
@@ -194,8 +193,7 @@ def test_a_cell_runs_on_one_thread(tmp_path):
 
         return [{"threads": max(library["num_threads"] for library in threadpool_info())}]
 
-    results = run_study(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1)
-    assert set(results.frame["threads"]) == {1}
+    assert set(run_study(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1).frame["threads"]) == {1}
 
 
 def learned(path):

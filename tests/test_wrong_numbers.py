@@ -94,8 +94,7 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(name, 
     step, clean = recording.links.step[links][runs], method(recording.of_runs(runs), [EGO]).x[:, :, 0]
     farthest = 0.0
     for kind in KINDS:
-        x = method(damaged(recording, kind, links).of_runs(runs), [EGO]).x[:, :, 0]
-        moved = norm(x - clean, axis=-1)
+        moved = norm(method(damaged(recording, kind, links).of_runs(runs), [EGO]).x[:, :, 0] - clean, axis=-1)
         farthest = max(farthest, float(moved.max()))
         later: Floats = np.array([row[t + 10 :].max() for row, t in zip(moved, step, strict=True)])
         beyond = after if name in FURTHER else BEYOND
@@ -284,8 +283,7 @@ def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane():
     assert np.isfinite(co.nees(TRACK, without(FLEET, (slice(77, None), slice(None))))).sum() == 3 * 77
     x, covariance = TRACK.x * [1, 1, 0], np.array(TRACK.covariance)
     covariance[..., 2, :] = covariance[..., :, 2] = 0
-    flat = [co.nees(replace(TRACK, x=x, covariance=covariance + np.diag([0, 0, v])), FLEET) for v in (0, 1)]
-    assert_allclose(*flat)
+    assert_allclose(*[co.nees(replace(TRACK, x=x, covariance=covariance + np.diag([0, 0, v])), FLEET) for v in (0, 1)])
 
 
 @pytest.mark.parametrize(

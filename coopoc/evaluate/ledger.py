@@ -70,13 +70,13 @@ class Ledger:
 
     def per_vehicle(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
         """Bytes of all, servers included, for each vehicle: the mean over runs."""
-        return float(self.of(kind, way).sum(axis=1).mean()) / max(len(self.names) - len(self.servers), 1)
+        return float(self.of(kind, way).sum(1).mean()) / max(len(self.names) - len(self.servers), 1)
 
     def rate(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
         """Bytes per second of driving and vehicle; InputError without any driving."""
         if not self.seconds.sum() > 0:
             raise InputError("seconds", self.seconds.tolist(), "must be > 0 for some vehicle", "Add a drive.")
-        return float(self.of(kind, way).sum(axis=1).mean() / self.seconds.sum())
+        return float(self.of(kind, way).sum(1).mean() / self.seconds.sum())
 
 
 def of_training(
@@ -134,7 +134,7 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     for k, on_air in enumerate((track.sent_bytes, track.received_bytes)):
         payload = on_air * (message.size() / size if size else 1.0)
         if message.per_neighbour:
-            payload = on_air - overhead * recording.present[:, track.egos].sum(axis=0)
+            payload = on_air - overhead * recording.present[:, track.egos].sum(0)
         moved[k] = payload, on_air
-    steps = np.full(vehicles, len(track.t)) if track.absent is None else (~track.absent).sum(axis=0)
+    steps = np.full(vehicles, len(track.t)) if track.absent is None else (~track.absent).sum(0)
     return Ledger(tuple(recording.ids[ego] for ego in track.egos), steps * recording.dt, *moved)

@@ -49,7 +49,7 @@ def rt_le(track: Track, fleet: Fleet) -> Floats:
     squares, present = errors(track, fleet) ** 2, fleet.present[:, list(track.egos)]
     present = present if track.absent is None else present & ~track.absent
     with errstate(invalid="ignore"):
-        return np.asarray(np.sqrt(np.sum(squares, axis=1, where=present) / present.sum(axis=0)))
+        return np.asarray(np.sqrt(np.sum(squares, axis=1, where=present) / present.sum(0)))
 
 
 def max_error(track: Track, fleet: Fleet) -> Floats:
@@ -157,7 +157,7 @@ def pose_nees(track: Track, fleet: Fleet) -> Floats:
     """
     turn = heading_error(track, fleet)
     error = np.concatenate([(track.x - _truth(track, fleet))[..., :2], turn[..., None]], axis=-1)
-    return np.asarray((error * solve(pose_covariance(track), error[..., None])[..., 0]).sum(axis=-1))
+    return np.asarray((error * solve(pose_covariance(track), error[..., None])[..., 0]).sum(-1))
 
 
 def pose_covariance(track: Track) -> Floats:
@@ -279,8 +279,8 @@ def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
     """Columns (R, E): `innovation_m`, the root mean square of the fixes' innovations, m; `fixes`, their number; `nis`,
     the mean of the normalised ones, 1 if consistent, of a method with a covariance. NaN where there is no second fix.
     """
-    square = (fix_innovations(track, recording) ** 2).sum(axis=-1)
-    count, normalised_square = np.isfinite(square).sum(axis=1), normalised_innovations(track, recording)
+    square = (fix_innovations(track, recording) ** 2).sum(-1)
+    count, normalised_square = np.isfinite(square).sum(1), normalised_innovations(track, recording)
     with errstate(invalid="ignore"):
         columns = {"innovation_m": np.sqrt(np.nansum(square, axis=1) / count), "fixes": count.astype(float)}
         if normalised_square is not None:

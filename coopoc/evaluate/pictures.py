@@ -195,7 +195,7 @@ def ellipses(ax: "Axes", center: Floats, covariance: Floats, color: str, label: 
     """
     from matplotlib.patches import Ellipse
 
-    for k in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(center).all(axis=1)).tolist():
+    for k in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(center).all(1)).tolist():
         values, axis = np.linalg.eigh(covariance[k])
         width, height = 2.0 * np.sqrt(SHARE_95 * np.maximum(values, 0.0))
         angle = float(np.degrees(np.arctan2(axis[1, 0], axis[0, 0])))

@@ -64,7 +64,7 @@ def scored(
     """
     seconds, parts, squares = 0.0, [], []
     there = recording.present[:, [recording.ids.index(ego) for ego in egos]]
-    has_truth = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
+    has_truth = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(0).all())
     for part in slabs(recording, len(egos)):
         track = follow(method, part, egos)
         wanted = tuple(map(part.ids.index, egos)), part.runs, *part.t.tolist()
@@ -90,7 +90,7 @@ def scored(
         if track.covariance is not None:
             each = nees(track, drive, method=method.name)
             made["nees"] = np.nanmean(each, axis=1)
-            squares.append(each.sum(axis=0))
+            squares.append(each.sum(0))
         parts.append(made)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)

@@ -100,7 +100,7 @@ def over_seeds(values: AnyArray) -> Interval:
     values = checked("values", values)
     if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
-    means = values.reshape(len(values), -1).mean(axis=1)
+    means = values.reshape(len(values), -1).mean(1)
     mean = float(means.mean())
     half = float(special.stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / np.sqrt(len(means)))
     return Interval(mean, mean - half, mean + half, len(means))

@@ -29,7 +29,7 @@ def read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
     try:
         lines = path.read_text("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        raise InputError(path.name, error, "must be text", "Check that this is the file you meant.") from None
+        raise InputError(path.name, error, "must be text in UTF-8", "Save it so, if it is that file.") from None
     for number, line in enumerate(lines, 1):
         words = line.split()
         if words and not words[0].startswith("#"):

@@ -159,7 +159,7 @@ def centre(recording: Recording, upload: Message) -> tuple[Floats, Floats]:
     measured = np.zeros(present.shape, int)
     np.add.at(measured, (links.step, links.observer), 1)
     sent = (present * upload.size(overhead, measured)).sum(axis=0, dtype=float)
-    received = present.sum(axis=0) * float(DOWNLOAD.size(overhead))
+    received = present.sum(0) * float(DOWNLOAD.size(overhead))
     runs = np.ones((recording.runs, 1))
     return runs * received, runs * sent
 
@@ -190,4 +190,4 @@ def located(recording: Recording) -> Bools:
     """
     present = recording.present
     joined = last_true(present & ~np.concatenate([np.zeros_like(present[:1]), present[:-1]]))
-    return present & (last_true(np.isfinite(recording.gnss).all(axis=-1), axis=1) >= joined)
+    return present & (last_true(np.isfinite(recording.gnss).all(-1), axis=1) >= joined)

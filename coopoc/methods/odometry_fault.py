@@ -80,5 +80,5 @@ def faults(recording: Recording, columns: Ints, noise_model: NoiseModel, fix: fl
 def failed(corrections: Floats, dt: float) -> Bools:
     """(T, N) when odometry fails in any run: where a correction of `faults` is larger than its deviation, or, of a
     vehicle in a run in which none is, wherever there is one."""
-    sure = np.square(dt * corrections[..., :2]).sum(axis=-1) > corrections[..., 2]
-    return np.asarray(np.where(sure.any(axis=1, keepdims=True), sure, corrections[..., 2] > 0.0).any(axis=0))
+    sure = np.square(dt * corrections[..., :2]).sum(-1) > corrections[..., 2]
+    return np.asarray(np.where(sure.any(axis=1, keepdims=True), sure, corrections[..., 2] > 0.0).any(0))

@@ -10,7 +10,7 @@ import pandas as pd
 import pyarrow as pa
 from pandas import DataFrame
 
-from ..arrays import Floats
+from ..arrays import Floats, listed
 from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, mean_interval
 from ..paths import given_path
@@ -123,10 +123,11 @@ class Results:
         frame = self.select(where)
         if frame.empty and where:
             raise InputError("where", dict(where), "must have a row with all of these values", "Name fewer of them.")
+        by = listed("by", by, 'Give ["method"].')
         for name in by:
             if name not in frame:
                 raise unknown("column", name, frame.columns)
-        yield from frame.groupby(list(by), sort=False, dropna=False)
+        yield from frame.groupby(by, sort=False, dropna=False)
 
     def summary(self, by: Sequence[str], value: str, where: Params | None = None) -> DataFrame:
         """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (egos left out).

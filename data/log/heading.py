@@ -147,7 +147,7 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
     if not per_part:
         return None, 1.0
     t, heading, variance, squares = (np.concatenate(each) for each in zip(*per_part, strict=True))
-    squares = squares.reshape(-1, len(OTHERWISE)).sum(axis=0)
+    squares = squares.reshape(-1, len(OTHERWISE)).sum(0)
     factor = OTHERWISE[squares.argmin() * int(squares.min() < FITS_BETTER * squares[0])]
     known, rate = np.isfinite(heading), way.yaw_rate
     if not known.any():
@@ -198,11 +198,11 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     assert track.heading is not None
     assert track.heading_covariance is not None
     known = 2.0 * std**2 + np.trace(track.covariance[:, :, 0, :2, :2], axis1=2, axis2=3)
-    sums = np.nancumsum(np.square(fix_innovations(track, rec)[:, :, 0]).sum(axis=-1) / known, axis=1)
-    best = sums[:FIRST_DIRECTIONS].argmin(axis=0), np.arange(len(t))
+    sums = np.nancumsum(np.square(fix_innovations(track, rec)[:, :, 0]).sum(-1) / known, axis=1)
+    best = sums[:FIRST_DIRECTIONS].argmin(0), np.arange(len(t))
     heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
     known = np.maximum.accumulate(variance < SURE**2)
-    return t, np.where(known, heading, nan), variance, sums[:, -1].reshape(len(OTHERWISE), -1).min(axis=1)
+    return t, np.where(known, heading, nan), variance, sums[:, -1].reshape(len(OTHERWISE), -1).min(1)
 
 
 def held(signal: Signal, at: Floats) -> Floats:

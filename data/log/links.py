@@ -65,7 +65,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     table = table.iloc[np.lexsort((table[0], table["observer"], table["step"]))]
     relative, arrival = table[[0, 1, 2]].to_numpy(dtype=float), table["arrival"].fillna(-1).to_numpy(dtype=np.int64)
     if steps.planar:
-        flat = np.isfinite(relative[:, :2]).all(axis=1) & np.isnan(relative[:, 2])
+        flat = np.isfinite(relative[:, :2]).all(1) & np.isnan(relative[:, 2])
         relative = np.where(flat[:, None] & (np.arange(3) == 2), np.pi / 2, relative)
         if flat.any():
             summary.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")

@@ -295,7 +295,7 @@ def _in_world(
         summary.refuse("speeds where a world velocity is given", speeds)
         moved = step_means(Signal(world.t, np.nan_to_num(world.value)), steps.grid)
         return moved, world, heading._replace(wanders=0.0, of_pace=np.zeros_like)
-    if len(speed.t) and (heading.at is not unknown or norm(speed.value.mean(axis=0)) < STANDS):
+    if len(speed.t) and (heading.at is not unknown or norm(speed.value.mean(0)) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))

@@ -261,7 +261,7 @@ def read_log(
         true_rows = local(true_rows, origin, Summary())[0]
         true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
         fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem, summary)
-        for name, share in zip(ids, np.isfinite(fleet.position[..., 0]).mean(axis=0), strict=True):
+        for name, share in zip(ids, np.isfinite(fleet.position[..., 0]).mean(0), strict=True):
             summary.vehicles[name] += f", truth {share:.0%}"
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
@@ -334,6 +334,8 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = _files(path) if path.is_dir() else [path]
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
+        strange = sorted(file.name for file in path.glob("[!.]*") if file.is_file() and not _is_read(file))
+        summary.refuse("files of kinds that are not read", len(strange), ", ".join(strange))
         true_files = true_files or [f for f in files if TRUTH_NAME.fullmatch(f.stem) and f != path]
         files = [f for f in files if f not in true_files and (not TRUTH_NAME.fullmatch(f.stem) or f == path)]
         if not files:

@@ -98,7 +98,7 @@ def together(log: Log) -> tuple[Log, str]:
         InputError: the vehicles share no two steps.
     """
     rec = log.recording
-    there = np.asarray(rec.present[:, rec.vehicles].all(axis=1))
+    there = np.asarray(rec.present[:, rec.vehicles].all(1))
     first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
     if last - first < 2 or not rec.vehicles:
         raise InputError(
@@ -151,7 +151,7 @@ def without_wild(c: Check) -> Check:
     if rec.body is not None or not wild.any():
         return c
     less = replace(rec, gnss=np.where(wild[..., None], nan, rec.gnss))
-    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(axis=0), failing=c.failing)
+    return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(0), failing=c.failing)
 
 
 def filtered(log: Log) -> Check:
@@ -189,7 +189,7 @@ def filtered(log: Log) -> Check:
         world = in_world(replace(rec, body=replace(rec.body, heading=heading[None])))
         world = between_origins(world, x[None], heading[None])
     gap, residual = residual_of(world, x, log.summary.reversed_pairs)
-    both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
+    both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(1)
     flat, distance = distances(gap)
     expected = np.column_stack([both, both / flat**2, both / distance**2])
     expected[:, 1] += heading_variance[links.step, links.observer]

@@ -101,6 +101,5 @@ def _peak() -> int:
 def _place(error: BaseException) -> str:
     """Our innermost line."""
     frames = traceback.extract_tb(error.__traceback__)
-    ours = [f for f in frames if "/site-packages/" not in f.filename and "/fuzz/" not in f.filename]
-    last = (ours or frames)[-1]
+    last = ([f for f in frames if "/site-packages/" not in f.filename and "/fuzz/" not in f.filename] or frames)[-1]
     return f"{Path(last.filename).name}:{last.lineno}"

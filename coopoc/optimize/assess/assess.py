@@ -374,8 +374,10 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
     most, spread = expected(problem, out) if pushing else (mean, variance)
     if implausible(truth.cost - spent, most, spread):
-        convex = problem.linear and all(c.measurement.linear for c in problem.constraints)
-        whys = [] if convex else ["a local minimum (try other x0, or certify it)"]
+        convex = not problem.movable.any() or (
+            problem.linear and all(c.measurement.linear for c in problem.constraints)
+        )
+        whys = [] if convex or not problem.movable.any() else ["a local minimum (try other x0, or certify it)"]
         if pushing:
             whys += [f"{pushing} bounds that push contradict the measurements"]
         elif equal := sorted({c.kind for c in problem.constraints if (c.lower == c.upper).any()}):
@@ -456,7 +458,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     Args:
         problem: that was solved.
         solution: of it.
-        nodes: k names or indices.
+        nodes: k names or indices; one alone is the first.
 
     Returns:
         (k, k, dof, dof) m^2, rad^2: block [i, j] between nodes i and j, zero where one cannot move.
@@ -476,7 +478,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     x = checked("solution", values, "(n, ambient)", (len(problem.names), problem.space.ambient))
     if problem.constraints:
         raise InputError("problem", "constraints", "must have none", "Read solution.covariance instead.")
-    places = [problem.index(node) for node in (nodes if isinstance(nodes, str) else several(nodes))]
+    places = [problem.index(node) for node in several(nodes)]
     if len(places) > len(problem.names):
         allowed = f"must name each of {len(problem.names)} nodes once"
         raise InputError("nodes", f"{len(places)} nodes", allowed, "Name each node once.")

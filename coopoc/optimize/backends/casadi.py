@@ -114,7 +114,8 @@ def programme(structure: Structure, max_iterations: int, thread: int) -> Any:
 
     symbols, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**symbols, "p": ca.vertcat(symbols["p"], scale), "f": scale * symbols["f"]}
-    return ca.nlpsol("solver", "ipopt", nlp, {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}})
+    options = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
+    return ca.nlpsol("solver", "ipopt", nlp, options)
 
 
 BACKEND = Backend(

@@ -411,8 +411,9 @@ class Constraint:
             except ValueError:
                 allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
                 raise InputError(name, side.shape, allowed, "Give one bound per component.") from None
-        wrong, field = ~(self.lower <= self.upper), f"lower bound of {self.kind}"  # of NaN, too
-        refuse(field, self.lower, wrong, "must be at most the upper one: lower <= upper", "No point can satisfy it.")
+        wrong = ~(self.lower <= self.upper) | ((self.lower == self.upper) & ~bounded(self))  # of NaN, too
+        allowed = "must be at most the upper one, and below infinity: lower <= upper"
+        refuse(f"lower bound of {self.kind}", self.lower, wrong, allowed, "No point can satisfy it.")
         if not bounded(self).any():
             raise InputError(f"bounds of {self.kind}", "none", "must bound something", "Leave the constraint out.")
 

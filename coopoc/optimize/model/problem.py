@@ -97,7 +97,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         for field in ("names", "factors", "poses", "fixed", "constraints"):
-            if not isinstance(value := getattr(self, field), str | Sequence):
+            if not isinstance(value := getattr(self, field), tuple):
                 self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
         names = tuple(map(str, self.names))
         if names != tuple(map(str, range(len(names)))):

@@ -86,7 +86,7 @@ def firm(ranges: Ranges) -> Bools:
     the share of a range's information by which the cost curves downwards midway to its image.
 
     >>> std = [[0.1, 0.1], [0.1, 0.1], [9.0, 9.0]]
-    >>> towers = Problem("abc", dimension=2).add("position", range(3), [[0.0, 0], [9, 0], [4, 3]], std=std)
+    >>> towers = Problem([*"abc"], dimension=2).add("position", range(3), [[0.0, 0], [9, 0], [4, 3]], std=std)
     >>> towers = towers.add("range", [("a", "c"), ("b", "c")], [5.0, 5.8], std=0.1)
     >>> firm(ranges_of(towers, towers.factors[0].z))
     array([ True,  True, False])
