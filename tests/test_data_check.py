@@ -47,6 +47,10 @@ FAULTS: dict[str, tuple[Any, str]] = {
         lambda f: f.assign(x=f["x"] + 15 * f.index.isin(np.flatnonzero(f["x"].notna())[::20])),
         r"car0: [45]\.\d% of the fixes lie beyond 5",
     ),
+    "milliseconds": (
+        lambda f: f.assign(t=1000 * f["t"] + 40 * f["range"].notna()),
+        r"car0: .*Is t in ms \(scale=t:1e-3\)",
+    ),
     "stamps without their fraction": (
         lambda f: f.assign(t=np.floor(f["t"])),
         r"\d\d% of what was logged is not used, mostly \d+ repeated rows .*stamp\.sec without nanosec",

@@ -200,9 +200,10 @@ def _to_step(table: DataFrame, members: Mapping[str, Member], steps: Steps, std:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
     their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_MOTIONS times
-    lag du. Nothing is moved where g or du is not known, but ranges and bearings of one time to what stands, which give
-    g from the observer. In body frames a bearing grows by lag w, too, with the observer's yaw rate w. And which are as
-    long as the longest range, where most of these fall short of g by more than `std`.
+    lag du, or a range would not stay above 0. Nothing is moved where g or du is not known, but ranges and bearings of
+    one time to what stands, which give g from the observer. In body frames a bearing grows by lag w, too, with the
+    observer's yaw rate w. And which are as long as the longest range, where most of these fall short of g by more than
+    `std`.
     """
     velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*LINK_COLUMNS, "component"))
@@ -213,7 +214,7 @@ def _to_step(table: DataFrame, members: Mapping[str, Member], steps: Steps, std:
         """(M, ...) means over the step in which each time lies; of the one before where the member is absent then."""
         return of_step[np.where(np.isnan(velocity[after, column, 0]), step, after), column]
 
-    path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
+    path = np.cumsum(np.nan_to_num(velocity) * steps.dt, 0)
     last = last_true(np.isfinite(fixes[..., 0]))
     position = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
     now = position[step, neighbour] - position[step, observer]
@@ -233,7 +234,7 @@ def _to_step(table: DataFrame, members: Mapping[str, Member], steps: Steps, std:
     away = norm(now, axis=1)
     full = (component == 0) & (value == value[component == 0].max(initial=0.0))
     full &= full.any() and np.median(np.nan_to_num(away - value)[full]) > std
-    gap, moved = np.minimum(away, distance), norm(now - then, axis=1)
-    vague = (gap <= NEAR_MOTIONS * moved) & (gap <= std)
-    value = value + np.where(vague, 0.0, np.nan_to_num(change[np.arange(len(change)), component]))
+    gap, far = np.minimum(away, distance), NEAR_MOTIONS * norm(now - then, axis=1)
+    value = value + np.nan_to_num(change[np.arange(len(change)), component])
+    vague = ((gap <= far) & (gap <= std)) | ((component == 0) & (value <= 0.0))
     return np.where(component == 1, wrap(value), value), vague, full
