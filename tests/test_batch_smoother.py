@@ -67,7 +67,7 @@ def compare(known: str, recording: Recording):
 def held(gnss: Any) -> Any:
     """Each vehicle's last fix, its first one before that."""
     t = np.maximum.accumulate(np.where(np.isfinite(gnss[..., 0]), np.arange(len(gnss))[:, None], -1))
-    return gnss[np.where(t < 0, np.isfinite(gnss[..., 0]).argmax(axis=0), t), np.arange(gnss.shape[1])]
+    return gnss[np.where(t < 0, np.isfinite(gnss[..., 0]).argmax(0), t), np.arange(gnss.shape[1])]
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
@@ -96,9 +96,9 @@ def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy):
     """NEES gate, and rms RT-LE against the bound beyond its interval (Student t on the runs), and not far above it."""
     fleet, recording, v2x = convoy
     track = BatchSmoother()(recording, [0, 4])
-    assert share_of_average(nees(track, fleet).mean(axis=0), 30).min() >= 0.95
+    assert share_of_average(nees(track, fleet).mean(0), 30).min() >= 0.95
     assert track.notes == (NOT_CAUSAL, CENTRE)
-    square = (rt_le(track, fleet) ** 2).mean(axis=1)
+    square = (rt_le(track, fleet) ** 2).mean(1)
     cov = fleet_bound(fleet, SPEED, v2x, smoothing=True)
     bound = np.mean([bound_rt_le(cov[:, e]) ** 2 for e in (0, 4)])
     half = half_width(square)

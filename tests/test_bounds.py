@@ -150,7 +150,7 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours, fo
     """rms RT-LE against the bound beyond its interval (chi-square on the runs), and not far above it."""
     fleet = formation.between(0, 400)
     v2x = V2X(max_neighbours=neighbours)
-    square = (rt_le(method(observe(fleet, S2, v2x, runs=40, observers=[0], seed=2), [0]), fleet) ** 2).mean(axis=1)
+    square = (rt_le(method(observe(fleet, S2, v2x, runs=40, observers=[0], seed=2), [0]), fleet) ** 2).mean(1)
     least = bound_rt_le(posterior_bound(fleet, S2, 0, v2x)) ** 2
     assert least - half_width(square) < square.mean() < 1.15 * least
 
@@ -256,8 +256,8 @@ def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method, k, ma
     marks = [name for name in fleet.ids if name[0] == "m"]
     track = method(co.observe(fleet, sensors, v2x, runs=120, seed=3, frame="body", landmarks=marks), [0])
     bound = co.pose_bound(fleet, sensors, v2x, landmarks=marks)[:, 0]
-    position = np.square(track.x - fleet.position[:, :1]).sum(axis=-1)[:, 10:, 0].mean(axis=1)
-    heading = np.square(co.heading_error(track, fleet))[:, 10:, 0].mean(axis=1)
+    position = np.square(track.x - fleet.position[:, :1]).sum(-1)[:, 10:, 0].mean(1)
+    heading = np.square(co.heading_error(track, fleet))[:, 10:, 0].mean(1)
     for square, least in (
         (position, np.trace(bound[10:, :3, :3], axis1=1, axis2=2).mean()),
         (heading, bound[10:, 3, 3].mean()),

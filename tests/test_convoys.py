@@ -23,7 +23,7 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task):
     assert count == (2 if task == "convoy-comma2k19" else 4)
     assert count * length <= len(drive.t)
     assert np.isfinite(recording.gnss[:, 0]).all()
-    assert norm(fleet.position[0] - fleet.position[0].mean(axis=0), axis=-1).max() < 2 * roads.START_SPREAD
+    assert norm(fleet.position[0] - fleet.position[0].mean(0), axis=-1).max() < 2 * roads.START_SPREAD
     error = (recording.gnss[0] - fleet.position)[..., :2]
     real = (drive.gnss[0, :, column] - truth.position[:, column])[:, :2]
     begins = roads._pieces(drive, column)[0]

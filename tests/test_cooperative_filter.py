@@ -464,7 +464,7 @@ def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int,
 def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured():
     """White noise as assumed, steps of 1 s, a third of the messages lost: not worse than the textbook's filter."""
     fleet = every(load_fleet("town10-validation"), 10).select(range(30))
-    moving = fleet.select(np.flatnonzero(fleet.present.all(axis=0)))
+    moving = fleet.select(np.flatnonzero(fleet.present.all(0)))
     moving = replace(moving, velocity=np.gradient(moving.position, fleet.dt, axis=0))
     seen = observe(moving, S2, V2X(4, radius=60.0, loss=0.35), runs=4, observers=[0, 1, 2])
     links = np.concatenate([seen.links.of(ego) for ego in range(3)])

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -46,6 +47,16 @@ FAULTS: dict[str, tuple[Any, str]] = {
     "one fix of twenty": (
         lambda f: f.assign(x=f["x"] + 15 * f.index.isin(np.flatnonzero(f["x"].notna())[::20])),
         r"car0: [45]\.\d% of the fixes lie beyond 5",
+    ),
+    "ranges of one end": (
+        lambda f: pd.concat(
+            [f, f.dropna(subset="range").eval("vehicle = partner\npartner = 'car0'\nrange = range + 1")]
+        ),
+        "ranges of car1 to car0 by .[01]",
+    ),
+    "reflections that last": (
+        lambda f: f.assign(range=f["range"] + 4 * f["t"].between(40, 60)),
+        "off for long, by no offset: car0 to car1 by [34]",
     ),
     "milliseconds": (
         lambda f: f.assign(t=1000 * f["t"] + 40 * f["range"].notna()),
@@ -195,6 +206,11 @@ def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path):
         text = said(read_log(log))
         assert message in text
         assert ("above the truth" in text) == bool(up)
+
+
+def test_what_is_added_to_all_ranges_is_no_scale(tmp_path):
+    pairs = dict.fromkeys(permutations([f"drone{k}" for k in range(4)], 2), 40.0)
+    assert "times as long" not in said(read_log(strange(tmp_path / "log", "drone", seconds=60, pairs=pairs)))
 
 
 @pytest.mark.parametrize(("who", "offset"), [("logged", 0.8), ("not logged", 0.8), ("logged", 20.0)])

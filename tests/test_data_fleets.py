@@ -47,13 +47,13 @@ def test_town10_is_dense_and_urban():
     assert 5 <= stated["neighbours"]["mean"] <= 7
     assert stated["speed"]["max"] < 11.1
     assert stated["speed"]["standing"] < 0.3
-    assert norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0).min() > 90, "every vehicle drives, m in 90 s"
+    assert norm(np.diff(fleet.position, axis=0), axis=2).sum(0).min() > 90, "every vehicle drives, m in 90 s"
 
 
 def test_clients_have_the_papers_lengths_and_speeds():
     """Published values: section IV.A, 8.9-10.8, 9.2-10.9, 0.7-10.7 and 3.6-10.7 m/s; lengths from its figure."""
     fleet = load_fleet("town10-clients")
-    assert fleet.present.sum(axis=0).tolist() == [1550, 4600, 1450, 1420]
+    assert fleet.present.sum(0).tolist() == [1550, 4600, 1450, 1420]
     assert (np.diff(fleet.present.astype(int), axis=0) <= 0).all(), "present from the start, absent after the end"
     speed = norm(fleet.velocity, axis=2)
     ranges = np.c_[np.nanmin(speed, axis=0), np.nanmax(speed, axis=0)]
@@ -77,8 +77,8 @@ def test_fleets_are_disjoint():
         assert not set(one.ids) & set(other.ids)
         steps = min(len(one.t), len(other.t), 900)
         for x in np.moveaxis(one.position[:steps], 1, 0):
-            same = abs(other.position[:steps] - x[:, None]).max(axis=2) < 0.5
-            assert same.mean(axis=0).max() < 0.5, "no vehicle drives where one of another fleet drives"
+            same = abs(other.position[:steps] - x[:, None]).max(2) < 0.5
+            assert same.mean(0).max() < 0.5, "no vehicle drives where one of another fleet drives"
 
 
 def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path):

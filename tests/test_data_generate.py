@@ -42,7 +42,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
     assert other["sha256"] != one["sha256"]
     fleet = load_fleet(tmp_path / "one" / "tiny.parquet")
     assert fleet.digest == one["sha256"]
-    assert fleet.present.sum(axis=0).tolist() == [60, 60, 60, 60, 60, 40]
+    assert fleet.present.sum(0).tolist() == [60, 60, 60, 60, 60, 40]
     assert one["speed"]["max"] > 2
 
 

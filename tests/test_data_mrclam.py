@@ -78,7 +78,7 @@ def test_odometry_follows_its_log_late_and_slower_in_turns(log, known):
     assert abs(known.lag - 0.1 * int(np.argmax(late))) <= 0.1
     wheel, turning = (np.interp(log.fleet.t - known.lag, log.fleet.t, v[:, 0]) for v in (log.speed, log.turn_rate))
     way = turned(log.fleet.velocity[:, 0], -midway(log.heading)[:, 0])[:, 0]
-    sums = np.c_[way, wheel, wheel * abs(turning)][1:7501].reshape(-1, 50, 3).sum(axis=1)
+    sums = np.c_[way, wheel, wheel * abs(turning)][1:7501].reshape(-1, 50, 3).sum(1)
     ahead, lost = lstsq(sums[:59, 1:], sums[:59, 0])[0]
     assert (known.speed[0], known.slip[0]) == pytest.approx((ahead, -lost / ahead), rel=0.01)
     slope = lstsq(sums[:59, 1:2], sums[:59, 0])[0][0]
@@ -94,7 +94,7 @@ def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_sta
     for landmarks, most in ((0, 0.32), (1, 0.25)):
         made = co.PoseFilter("fleet", lasting=True, gate=5.0, begin=begin)
         track = made(thinned(seen, landmarks, 3000), log.fleet.ids)
-        squares = np.square(track.x[0, 3000:7500] - log.fleet.position[3000:7500]).sum(axis=-1)
+        squares = np.square(track.x[0, 3000:7500] - log.fleet.position[3000:7500]).sum(-1)
         assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), axis=1)).mean() < most
 
 
@@ -196,7 +196,7 @@ def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log):
     assert fleet.digest == log.fleet.digest
     assert fleet.dt == 0.1
     assert 750 < fleet.t[-1] < 772
-    absent = (~fleet.present).sum(axis=0)
+    absent = (~fleet.present).sum(0)
     assert absent[[0, 1, 2, 4]].tolist() == [0, 0, 0, 0]
     assert 15 <= absent[3] <= 30, "a gap of 2 s (and one of 0.55 s)"
     assert np.nanmax(abs(fleet.position[..., 2])) == 0

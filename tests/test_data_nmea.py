@@ -170,7 +170,7 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):
     assert_allclose(actual.position[:, 0], fleet.position[:, 0], atol=1e-6)
     assert_allclose(actual.heading[:, 0], np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]), atol=1e-6)
     body = read_log(path, dt=0.1, ignore=["/car0/pose", "/car1/imu"], frame="body").recording.body
-    assert abs(body.yaw_rate[0]).max(axis=0) == pytest.approx([0.06, 0.0], abs=1e-3)
+    assert abs(body.yaw_rate[0]).max(0) == pytest.approx([0.06, 0.0], abs=1e-3)
     stands = read_log(path, dt=0.1, ignore=["/car0/pose"], truth="/car1/odom", origin=(48.14, 11.58, 560.0)).truth
     assert not stands.position[:, 1].any()  # that of its poses, which the test left at zero
     for wrong, match in (({"truth": "/car0/poses"}, "Did you mean /car0/pose"), ({"kinds": {"a": "x"}}, "to tables")):
@@ -196,7 +196,7 @@ def test_motion_capture_and_radios_of_a_public_bag():
     way = {name: np.array(raw[f"/vrpn_client_node/{name}/pose"]) for name in recording.ids}
     one = way["turtlebot1"]
     k = recording.ids.index("turtlebot1")
-    near = np.array([abs(one[:, 1:] - fix).sum(axis=1).min() for fix in recording.gnss[0, 100:200, k]])
+    near = np.array([abs(one[:, 1:] - fix).sum(1).min() for fix in recording.gnss[0, 100:200, k]])
     assert np.nanmax(near) < 1e-5  # a fix is brought to its step
     errors = []
     for topic, rows in raw.items():

@@ -49,12 +49,12 @@ def test_of_all_subsets_it_finds_the_best():
         bound = chi2.ppf(0.99, 3)
         chosen = np.array(list(itertools.product([0.0, 1.0], repeat=9)))
         x = chosen @ z / (chosen.sum(axis=1, keepdims=True) + 1 / 9)
-        square = np.minimum(((z - x[:, None]) ** 2).sum(axis=2), bound).sum(axis=1) + (x**2).sum(axis=1) / 9
+        square = np.minimum(((z - x[:, None]) ** 2).sum(2), bound).sum(1) + (x**2).sum(1) / 9
         best = 0.5 * square.min()
         ours = solve_gnc(problem, candidates=[1])
         truncated = ours.cost + 0.5 * bound * (ours.extras["weights"] == 0).sum()
         assert truncated >= best - 1e-9
-        assert np.array_equal(ours.extras["weights"] == 1, ((z - ours.x) ** 2).sum(axis=1) <= bound)
+        assert np.array_equal(ours.extras["weights"] == 1, ((z - ours.x) ** 2).sum(1) <= bound)
         found += truncated <= best + 1e-9
     assert found >= 19
 

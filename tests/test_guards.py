@@ -83,7 +83,7 @@ def test_a_filter_is_back_within_five_seconds_of_the_end_of_an_attack(method, dt
     recording = observe(drive, Sensors(gnss_std=(1.5,) * 3, velocity_std_ratio=0.1), V2X(0), runs=20)
     off = 15.0 * ((t >= 20.0) & (t < 50.0))[:, None, None] * [1.0, 0.0, 0.0]
     gap = method(replace(recording, gnss=recording.gnss + off)).x - method(recording).x
-    moved: Floats = norm(gap, axis=-1)[..., 0].mean(axis=0)
+    moved: Floats = norm(gap, axis=-1)[..., 0].mean(0)
     assert moved[(t > 45.0) & (t < 50.0)].max() > 10.0
     assert moved[(t >= 55.0) & (t < 65.0)].max() < 1.5
 
@@ -142,7 +142,7 @@ def test_covariances_are_doubted_where_scipys_chi_square_law_leaves_no_chance():
     still = Fleet(("a",), np.arange(5.0), np.zeros((5, 1, 3)), np.zeros((5, 1, 3)))
     recording = observe(still, Sensors(gnss_std=(1.0,) * 3), V2X(0), runs=60)
     x = np.zeros((60, 5, 1, 3)) + np.linspace(0.0, 2.0, 60)[:, None, None, None]
-    square = ((recording.gnss - x).mean(axis=1) ** 2).sum(axis=-1)[:, 0] / (0.2 + 0.01)
+    square = ((recording.gnss - x).mean(1) ** 2).sum(-1)[:, 0] / (0.2 + 0.01)
     cov = np.broadcast_to(0.01 * np.eye(3), (*x.shape, 3)).copy()
     noted = [bool(doubts(recording.of_runs([k]), [0], x[[k]], cov[[k]])) for k in range(60)]
     assert noted == (square > DOUBT).tolist()

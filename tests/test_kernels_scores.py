@@ -30,8 +30,8 @@ def test_runs_are_scored_by_fours(crossing, monkeypatch):
     found = scores.scored(JointFilter(), seen, ["c0", "c5"], crossing, quantiles=3)
     assert_allclose(found["error_quantiles_m"][..., 2], found["max_error_m"])
     whole = JointFilter()(seen, ["c0", "c5"])
-    assert_allclose(found["nees"], nees(whole, crossing).mean(axis=1), rtol=1e-12)
-    assert_allclose(found["nees_inside"][0], share_of_average(nees(whole, crossing).mean(axis=0), seen.runs))
+    assert_allclose(found["nees"], nees(whole, crossing).mean(1), rtol=1e-12)
+    assert_allclose(found["nees_inside"][0], share_of_average(nees(whole, crossing).mean(0), seen.runs))
 
 
 def test_a_start_that_is_known_has_no_nees(crossing):

@@ -24,7 +24,7 @@ def town():
 
 def rms(recording: Recording, fleet: Fleet, **priors: float) -> tuple[float, co.Track]:
     track = CooperativeFilter(priors=Priors()._replace(**priors))(recording, [3, 8])
-    return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(axis=-1).mean())), track
+    return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(-1).mean())), track
 
 
 @pytest.mark.parametrize("priors", [ONLY_SCALE, ONLY_SCALE._replace(absent=-np.inf, exact=4.0)])

@@ -82,7 +82,7 @@ def test_filters_that_claim_a_covariance_are_consistent(name, formation):
     """NEES gate: 95 % of the steps have their run-averaged NEES in the 99 % chi-square band; noise without bias."""
     fleet = formation.between(0, 300)
     recording = observe(fleet, S2, V2X(max_neighbours=6), runs=40, seed=1, observers=[0])
-    assert share_of_average(nees(METHODS[name]("nominal")(recording, [0]), fleet).mean(axis=0), 40).min() >= 0.95
+    assert share_of_average(nees(METHODS[name]("nominal")(recording, [0]), fleet).mean(0), 40).min() >= 0.95
 
 
 def test_a_fitted_noise_model_finds_the_acting_noise(formation):

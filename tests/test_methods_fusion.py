@@ -31,7 +31,7 @@ def test_ci_is_not_over_confident_in_traffic():
     """NEES on a crop of town10: mean at most 3 beyond its interval, far above for the naive sum of MSMV-R."""
     fleet = co.load_fleet("town10").between(0, 250)
     recording = observe(fleet, S2, V2X(max_neighbours=10), runs=8, seed=2, observers=[0, 12, 24])
-    found = {m.name: nees(m(recording, [0, 12, 24]), fleet).mean(axis=1) for m in (*FILTERS[:2], co.MSMV("nominal"))}
+    found = {m.name: nees(m(recording, [0, 12, 24]), fleet).mean(1) for m in (*FILTERS[:2], co.MSMV("nominal"))}
     for name in ("ci", "split-ci"):
         per_drive = found[name].ravel()
         half = 2.58 * per_drive.std(ddof=1) / np.sqrt(len(per_drive))
@@ -50,7 +50,7 @@ def test_a_late_message_is_no_surer_than_it_is():
     for t, star in enumerate(stars(recording, 0, known, SPLIT.message, sent=own, growth=ESTIMATE_GROWTH)):
         age = t - box.newest[:, box.start[t] : box.start[t + 1]]
         gap = star.position[:, 1:] - fleet.position[t, star.member[1:]]
-        late = (age >= 5) & np.isfinite(star.variance[:, 1:]).all(axis=-1) & (t >= 20)
+        late = (age >= 5) & np.isfinite(star.variance[:, 1:]).all(-1) & (t >= 20)
         share += [*(gap**2 / star.variance[:, 1:])[late]]
     assert 0.3 < np.array(share)[:, :2].mean() < 1.1
 

@@ -40,7 +40,7 @@ def test_no_method_falls_behind(name):
 
     def ahead(method):
         error = method(seen, [0]).x[:, 10:, 0, 0] - fleet.position[10:, 0, 0]
-        return np.asarray(error.mean(axis=1))
+        return np.asarray(error.mean(1))
 
     models = NoiseModel.nominal(NOISY), NoiseModel.oracle(NOISY, fleet)
     found = np.subtract(*(ahead(METHODS[name](known)) for known in models))

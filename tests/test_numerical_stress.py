@@ -146,7 +146,7 @@ def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Record
     for fleet, recording in drives:
         for name in names.split():
             track = METHODS[name]("nominal")(recording, [0])
-            squares.setdefault(name, []).append((off(track.x, fleet) ** 2).sum(axis=-1))
+            squares.setdefault(name, []).append((off(track.x, fleet) ** 2).sum(-1))
             assert name == "kalman" or any(words in note for note in track.notes), name
     return {name: float(np.sqrt(np.mean(found))) for name, found in squares.items()}
 

@@ -52,7 +52,7 @@ def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(fault, ev
 
     def late(method):
         track = method(broken, EGOS)
-        return float(np.sqrt(np.square(track.x - truth)[:, 300:].sum(axis=-1).mean())), track
+        return float(np.sqrt(np.square(track.x - truth)[:, 300:].sum(-1).mean())), track
 
     raw = late(co.GNSS())[0]
     for method in (Kalman(), JointFilter(), CooperativeFilter()):
@@ -67,7 +67,7 @@ def test_a_neighbour_whose_wheels_spin_costs_the_joint_filter_little():
     velocity = seen.velocity.copy()
     velocity[:, BEGINS:, np.setdiff1d(np.arange(len(seen.ids)), EGOS)[::2]] *= 2.0
     errors = [
-        np.sqrt(np.square(JointFilter()(one, EGOS).x - truth).sum(axis=-1).mean())
+        np.sqrt(np.square(JointFilter()(one, EGOS).x - truth).sum(-1).mean())
         for one in (seen, replace(seen, velocity=velocity))
     ]
     assert errors[1] < 1.5 * errors[0]
@@ -95,7 +95,7 @@ def test_odometry_that_errs_a_little(fault, every, beside):
     relative = np.where([True, False, False], seen.relative, np.nan)
     log = replace(seen, velocity=seen.velocity + wrong, relative=relative, notes=(NOTHING_SIMULATED,))
     kalman, joint, mine = (
-        np.sqrt(np.square(m(log, (0, 1)).x - fleet.position)[:, 900:, :, :2].sum(axis=-1).mean())
+        np.sqrt(np.square(m(log, (0, 1)).x - fleet.position)[:, 900:, :, :2].sum(-1).mean())
         for m in (Kalman(), JointFilter(), CooperativeFilter())
     )
     most = 10.0 if fault == "stands" else 2.0
@@ -126,7 +126,7 @@ def test_the_correction_is_the_velocity_of_filterpys_filter():
     peer.x, peer.P = np.array([*seen.gnss[0, 0, EGOS[0], :2], 0.0, 0.0]), np.diag([12.25, 12.25, 1.0, 1.0])
     peer.H, found = np.eye(2, 4), []
     for k in range(10, STEPS, 10):
-        way, r = 0.1 * u[k - 9 : k + 1].sum(axis=0), 12.25 * level
+        way, r = 0.1 * u[k - 9 : k + 1].sum(0), 12.25 * level
         process = UNKNOWN * (0.1 * S2.velocity_std_ratio) ** 2 * (way**2).sum() * 10
         walk = np.kron(PACES[1][0] * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]), np.eye(2))
         peer.F, peer.R = np.eye(4) + np.eye(4, k=2), r * np.eye(2)

@@ -248,7 +248,7 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken():
     assert norm(start[c] - start[b]) > 0
     x0[c, :2] = x0[b, :2]  # far from the origin
     moved = directed(from_graph(together, start="odometry"), x0)
-    assert np.flatnonzero((moved != x0).any(axis=1)).tolist() == [b, c]
+    assert np.flatnonzero((moved != x0).any(1)).tolist() == [b, c]
     assert 0 < norm((moved[c] - moved[b])[:2]) < 0.5
 
 
@@ -310,7 +310,7 @@ def test_a_weak_measurement_is_no_free_node(weight):
     assert found.status is Status.SOLVED
     problem = from_graph(graph)
     nodes = problem.factors[0].nodes
-    keep, factor = np.flatnonzero((nodes != [49, 50]).any(axis=1)), problem.factors[0]
+    keep, factor = np.flatnonzero((nodes != [49, 50]).any(1)), problem.factors[0]
     cut = Factor(factor.kind, nodes[keep], factor.z[keep], std=factor.std[keep])
     apart = solve(replace(problem, factors=(cut,)), throw=False)
     assert apart.status is Status.RANK_DEFICIENT

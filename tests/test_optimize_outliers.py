@@ -70,7 +70,7 @@ def test_predictions_are_those_of_dense_algebra():
     size = problem.factors[0].size
     rows: Ints = (size * np.array(candidate[1])[:, None] + np.arange(size)).ravel()
     known = np.delete(whole, rows, axis=0)
-    moving = np.flatnonzero(abs(whole).sum(axis=0))
+    moving = np.flatnonzero(abs(whole).sum(0))
     P = inv((known.T @ known)[np.ix_(moving, moving)])
     for k, row in enumerate(candidate[1]):
         J = whole[size * row : size * row + size][:, moving]

@@ -196,7 +196,7 @@ def test_offsets_that_ranges_share_are_scipys(backend):
 
     theirs = least_squares(residual, np.append(path, [0.0, 0.0]), xtol=1e-14, gtol=1e-12)
     names = [*map(str, range(steps)), "A", "B", "offset A", "offset B"]
-    problem = Problem(names, x0=np.concatenate([path, anchors, np.zeros((2, 2))]), dimension=2, fixed="AB").add(
+    problem = Problem(names, x0=np.concatenate([path, anchors, np.zeros((2, 2))]), dimension=2, fixed=[*"AB"]).add(
         "displacement", [*pairwise(names[:steps])], moved, 0.05
     )
     problem = problem.add(

@@ -273,4 +273,4 @@ def test_a_point_among_poses_has_no_rotation_to_move(poses):
     x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
     problem = Problem([*"abc"], x0=x0, dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)
-    assert problem.movable.sum(axis=1).tolist() == wanted.tolist()
+    assert problem.movable.sum(1).tolist() == wanted.tolist()

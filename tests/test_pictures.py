@@ -42,7 +42,7 @@ def test_an_ellipse_holds_95_percent():
     assert patch.width * patch.height == pytest.approx(4 * stats.chi2.ppf(0.95, 2) * np.sqrt(np.linalg.det(cov)))
     points = np.random.default_rng(0).multivariate_normal([3.0, -2.0], cov, 20_000)
     along = patch.get_patch_transform().inverted().transform(points)  # to the unit circle
-    assert ((along**2).sum(axis=1) < 1).mean() == pytest.approx(0.95, abs=0.005)
+    assert ((along**2).sum(1) < 1).mean() == pytest.approx(0.95, abs=0.005)
 
 
 def test_a_recording_shows_its_fixes_and_links(seen):

@@ -78,7 +78,7 @@ def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact, arm):
         first = begin[run, members], spread
         wanted, covariance = oracle.pose_filter(measured, noise, first, d, 3 if exact else 1, run)
         scale, here = np.sqrt(np.einsum("...ii->...i", covariance)) + 1e-3, measured.active
-        assert (np.isfinite(x[run]).all(axis=-1) == here).all()
+        assert (np.isfinite(x[run]).all(-1) == here).all()
         assert (abs(x[run] - wanted) / scale)[here].max() < 1e-3  # derivatives of the oracle are numerical
         assert (abs(cov[run] - covariance) / (scale[..., None] * scale[..., None, :]))[here].max() < 1e-3
 

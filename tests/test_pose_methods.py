@@ -45,7 +45,7 @@ def test_white_noise_stays_inside_the_band(unit, masts, fix):
     """Chi-square of 3 degrees of freedom, run-averaged, on at least 95 % of the steps."""
     fleet, noise = convoy(masts=masts), replace(WHITE, velocity_reading="speed", gnss_std=(fix,) * 3)
     found = co.pose_nees(co.PoseFilter(unit)(observed(fleet, noise), ["v1", "v2"]), fleet)
-    assert share_of_average(found.mean(axis=0), 30).min() >= 0.95
+    assert share_of_average(found.mean(0), 30).min() >= 0.95
     low, high = nees_band(30 * 20)  # about as many independent values as there are runs and correlation times
     assert low < found.mean() < high
 
@@ -202,7 +202,7 @@ def test_wheels_that_stand_lead_neither_their_robot_nor_its_fleet_away(seed):
     velocity, every = seen.velocity.copy(), [*range(len(seen.ids))]
     velocity[:, int(15 / seen.dt) : int(20 / seen.dt), 0] = 0.0
     tracks = (co.PoseFilter("fleet")(recording, every) for recording in (seen, replace(seen, velocity=velocity)))
-    clean, wrong = (co.rt_le(track, drawn.fleet).mean(axis=0) for track in tracks)
+    clean, wrong = (co.rt_le(track, drawn.fleet).mean(0) for track in tracks)
     assert (wrong[1:] < 1.3 * clean[1:]).all()
     assert wrong[0] < 5.0
 

@@ -72,8 +72,8 @@ def test_an_attack_begins_creeps_and_colludes(crossing, clean):
     for step, t in enumerate(crossing.t - crossing.t[0]):
         assert late[:, step] == pytest.approx(full[:, step] * (t > 0.99), abs=1e-9)
         assert slow[:, step] == pytest.approx(full[:, step] * min(max(t - 1.0, 0.0) / 2.0, 1.0), abs=1e-9)
-    wrong = abs(alike[:, 0]).max(axis=-1) > 1e-9
-    assert np.array_equal(wrong, abs(full[:, 0]).max(axis=-1) > 1e-9)
+    wrong = abs(alike[:, 0]).max(-1) > 1e-9
+    assert np.array_equal(wrong, abs(full[:, 0]).max(-1) > 1e-9)
     for one, offsets in zip(wrong, alike[:, 0], strict=True):
         assert abs(offsets[one] - offsets[one][:1]).max(initial=0.0) < 1e-9
 

@@ -169,7 +169,7 @@ def test_a_state_without_process_noise_stays_finite(crossing):
     still = standing(crossing.position[0], 60)
     recording = observe(still, S2, V2X(max_neighbours=4, loss=0.2), runs=2)
     track = textbook(JointFilter(known))(recording, [1])
-    mean = recording.gnss[:, :, 1].mean(axis=1)
+    mean = recording.gnss[:, :, 1].mean(1)
     assert np.isfinite(track.x).all()
     assert abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < abs(mean - still.position[-1, 1]).mean() + 0.5
 
@@ -193,7 +193,7 @@ def test_linear_filters_equal_filterpy(formation, laplacian):
         else:
             ahead = vectors
         cov = known.relative_cov(seen if laplacian else np.array([spherical(*vector) for vector in ahead]))
-        cov = [np.trace(cov.mean(axis=0)) / 3 * np.diag(np.diag(rows))] if laplacian else cov
+        cov = [np.trace(cov.mean(0)) / 3 * np.diag(np.diag(rows))] if laplacian else cov
         noise = block_diag(np.diag([*known.gnss_variance] * 4), *cov)
         fixes = recording.gnss[1, t, order].ravel()
         z = np.append(fixes, edges.T @ vectors if laplacian else vectors)

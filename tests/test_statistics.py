@@ -51,7 +51,7 @@ def test_scores_go_in_as_they_come_out():
     seen = observe(fleet, Sensors.paper_scenario2(), V2X(4), runs=20, observers=[0, 3, 5])
     a, b = (rt_le(method(seen, [0, 3, 5]), fleet) for method in (Kalman(), JointFilter()))
     ours = paired_difference(a, b)
-    per_ego = (a - b).mean(axis=0)
+    per_ego = (a - b).mean(0)
     half = stats.t.ppf(0.975, 2) * per_ego.std(ddof=1) / np.sqrt(3)
     assert ours.mean == pytest.approx(per_ego.mean())
     assert 0.5 * half < ours.high - ours.mean < 2.0 * half
@@ -98,5 +98,5 @@ def test_alignment_is_scipys(side):
     estimate = rng.normal(size=(50, 3)) * [9, 5, 1]
     truth = Rotation.from_rotvec([0.3, -0.2, 2.0]).apply(estimate * [1, 1, side])
     truth += rng.normal([40, -7, 3], 0.1, truth.shape)
-    _, left = Rotation.align_vectors(truth - truth.mean(axis=0), estimate - estimate.mean(axis=0))
+    _, left = Rotation.align_vectors(truth - truth.mean(0), estimate - estimate.mean(0))
     assert alignment_error(estimate, truth) == pytest.approx(left / np.sqrt(50))

@@ -208,7 +208,7 @@ def test_recording_holds_no_truth(crossing):
         value = getattr(recording, name)
         assert not isinstance(value, Fleet)
         if isinstance(value, np.ndarray) and value.shape[-3:] == crossing.position.shape:
-            assert not any(np.isclose(value, truth, atol=1e-6).all(axis=-1).any() for truth in truths), name
+            assert not any(np.isclose(value, truth, atol=1e-6).all(-1).any() for truth in truths), name
 
 
 def test_unknown_and_unrecorded_egos(crossing):

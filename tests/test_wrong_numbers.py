@@ -120,7 +120,7 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
     box = inbox(given, EGO, method.message)
     seen, assumed = measurements(given, EGO, box), assumptions(given, known, EGO, box)
     answer = run_filter(seen, assumed, sent, np.zeros((RUNS, len(given.t), 4)), model_of(known, method.priors))[0]
-    return answer[..., -12:-9], np.sqrt(answer[..., -9::4].sum(axis=-1))
+    return answer[..., -12:-9], np.sqrt(answer[..., -9::4].sum(-1))
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "position", "odometer", "velocity"])

@@ -234,7 +234,7 @@ class CooperativeFilter(Checked):
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
             shares = weights[..., : len(WEIGHED)]
-            low, measured = (shares < 0.1).sum(axis=0), np.isfinite(shares).sum(axis=0)
+            low, measured = (shares < 0.1).sum(0), np.isfinite(shares).sum(0)
             for j in np.unique(inputs.neighbour):
                 here = inputs.neighbour == j
                 clock = weights[:, here, len(WEIGHED)]
@@ -242,7 +242,7 @@ class CooperativeFilter(Checked):
                 if abs(ahead) > NOTED_CLOCK:
                     way = "ahead, or its messages are late" if ahead > 0 else "behind"
                     notes.append(f"clock, {recording.ids[j]}: {abs(ahead):.2g} s {way}")
-                for kind, count, of in zip(WEIGHED, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
+                for kind, count, of in zip(WEIGHED, low[here].sum(0), measured[here].sum(0), strict=True):
                     what = f"{kind}, {own_id} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(x, cov.reshape(*x.shape, 3), neighbours, extras=extras)
@@ -267,7 +267,7 @@ def otherwise(ego: str, estimates: Floats, fix: float = 1.0, stated: Sequence[fl
     >>> otherwise("a", np.array([[[0.0] * 7 + [0.4] + [1.0] * 5]]), 2.0)  # of a road, where nothing was wrong
     []
     """
-    estimates = estimates[:, np.isfinite(estimates[..., 4]).any(axis=0)]  # from where it knows where it is
+    estimates = estimates[:, np.isfinite(estimates[..., 4]).any(0)]  # from where it knows where it is
     late = estimates[:, estimates.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
     usual[5:7] = np.nanmean(estimates[..., 5:7], axis=(0, 1))

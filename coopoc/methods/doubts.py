@@ -63,7 +63,7 @@ def doubts(
     doubtful = mark_estimates(recording.gnss, x, claimed, egos, fixes, every, marks)
     doubtful += DOUBT * (neighbours is not None)
     noted = [any(note.startswith(NOTE.format(recording.ids[ego])) for note in earlier) for ego in columns]
-    looked_at = egos[(doubtful > DOUBT / 3.0).any(axis=0) & ~np.array(noted)]
+    looked_at = egos[(doubtful > DOUBT / 3.0).any(0) & ~np.array(noted)]
     if recording.body is None and len(looked_at):
         corrections = faults(recording, looked_at, NoiseModel.nominal(sensors))
         marks[2] = 0 if corrections is None else failed(corrections, recording.dt)[:, egos].T
@@ -83,6 +83,6 @@ def doubts(
             std = np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std])
             star = recording.gnss, recording.relative, x[:, :, k], claimed[:, :, k], theirs, rows
             mark_neighbours(*star, fixes, std, 2 * every, far)
-            for kind, j in np.argwhere(far.any(axis=2)).tolist():
+            for kind, j in np.argwhere(far.any(2)).tolist():
                 add(NEIGHBOUR_DOUBTS[kind], far[kind, j], ego, j)
     return tuple(notes)

@@ -67,7 +67,7 @@ def follow_egos(
                 for name, values in result.extras.items():
                     extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(result.step, int) else len(recording.t[result.step]))
-    absent = np.logical_and.accumulate(np.isnan(x[..., 0]).any(axis=0))  # a later NaN is an error
+    absent = np.logical_and.accumulate(np.isnan(x[..., 0]).any(0))  # a later NaN is an error
     notes = (*notes, *doubts(recording, columns, x, cov, getattr(method, "noise_model", "nominal"), neighbours, notes))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them

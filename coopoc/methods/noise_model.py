@@ -303,7 +303,7 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
         fix = float(np.square(noise_model.gnss_std[:2]).mean())
         links, moving = recording.links, (recording.velocity[0] != 0.0).any(axis=(0, 2))
         ranges = np.unique(links.observer * len(moving) + links.neighbour, return_counts=True)[1].max()
-        fixes = np.isfinite(recording.gnss[0, :, moving, 0]).sum(axis=1).max(initial=0)
+        fixes = np.isfinite(recording.gnss[0, :, moving, 0]).sum(1).max(initial=0)
         often = max(float(ranges / (fixes or ranges)), 1.0)  # of the pair that measures most, to a fix
         arc, why = (
             np.sqrt(2.0 * often) * fix / far,
@@ -327,7 +327,7 @@ def _offsets(recording: Recording, noise: Sensors) -> Iterator[str]:
     one, other = recording.gnss[0][links.step, ends]
     off = ranges - np.linalg.norm(other - one, axis=1)
     for pair in np.unique(ends, axis=1).T if recording.measured else ():
-        here = (pair == ends.T).all(axis=1) & np.isfinite(off)
+        here = (pair == ends.T).all(1) & np.isfinite(off)
         if here.sum() > OFFSET_COUNT:
             parts = [part.mean() for part in np.array_split(off[here], OFFSET_PARTS)]
             least = 2.0 * noise.range_std + off[here].var() / ranges[here].mean()

@@ -85,7 +85,7 @@ def stars(
         here = slice(messages.start[t], messages.start[t + 1])
         before, member = member, np.append(ego, recording.links.neighbour[messages.link[here]])
         same = np.pad(member[:, None] == before, ((0, 0), (0, 1)), constant_values=True)
-        previous = np.where(same[:, :-1].any(axis=1), same.argmax(axis=1), -1)
+        previous = np.where(same[:, :-1].any(1), same.argmax(1), -1)
         last, newest = np.append(newest, -2 * each, axis=1), np.append(t * each, messages.newest[:, here], axis=1)
         served = np.append(uses, each, axis=1)[:, previous]
         uses = np.where((previous >= 0) & (last[:, previous] == newest), served + 1, 1)
@@ -96,7 +96,7 @@ def stars(
         position, variance = fixes[run, s, member] + age * moved, variances[run, s, member]
         variance = variance + age * (growth[0] * age + growth[1]) * step_variance
         position[:, 0], variance[:, 0] = recording.gnss[:, t, ego], r[:, t, ego]
-        known_position = held & np.isfinite(position).all(axis=-1)
+        known_position = held & np.isfinite(position).all(-1)
         yield StarStep(
             t,
             member,

@@ -111,7 +111,7 @@ class Track:
         if self.absent is not None:
             self.__dict__["absent"] = checked("absent", self.absent, "(T, E)", x.shape[1:3], bool)
         there = np.ones(x.shape[1:3], bool) if self.absent is None else ~self.absent
-        lost = there & ~np.isfinite(self.x).all(axis=-1)
+        lost = there & ~np.isfinite(self.x).all(-1)
         if lost.any():
             run, step, ego = np.argwhere(lost)[0]
             raise InputError(
@@ -170,7 +170,7 @@ def far_off(x: Floats, recording: Recording, columns: Sequence[int]) -> Bools:
     gap = recording.gnss.take(columns, axis=2)
     gap -= x
     far = np.einsum("...c,...c->...", gap, gap) > LOST_STDS**2 * np.square(recording.sensors.gnss_std).sum()
-    return np.asarray(far.any(axis=1))
+    return np.asarray(far.any(1))
 
 
 @runtime_checkable
@@ -265,7 +265,7 @@ def noted(track: Track) -> Track:
     track = instance("what the method returns", track, Track, "docs/extend.md shows one.")
     if track.absent is None:
         return track
-    for ego in np.array(track.egos)[track.absent.all(axis=0)].tolist():
+    for ego in np.array(track.egos)[track.absent.all(0)].tolist():
         hint = "Choose another ego, or measure ranges and both angles to neighbours that have fixes."
         raise InputError("egos", repr(track.ids[ego]), "has no fix, and no neighbour shows where it is", hint)
     gaps = f"absent, or not placed yet, at {track.absent.sum()} of {track.absent.size} steps: no estimate there"

@@ -300,7 +300,7 @@ def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) ->
     """Why nodes x (n, ambient) are no minimum that stands: a node far away, two that coincide, a step that is left."""
     at, names = problem.space.position(x), problem.names
     off = norm(at - np.median(at, axis=0), axis=1)
-    extent, lost = np.median(off), (off * problem.movable.any(axis=1)).argmax()
+    extent, lost = np.median(off), (off * problem.movable.any(1)).argmax()
     if off[lost] > AWAY * extent > 0.0:
         yield f"{names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby"
     if status is Status.SOLVED:

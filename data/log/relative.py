@@ -179,7 +179,8 @@ def of_measurements(c: Check) -> Iterator[str]:
             ratios = measured[far] / np.maximum(true[far], 1e-3)
             ratio = np.median(ratios) if len(ratios) >= LEAST_COUNT else 1.0
             wrong |= (other := not 0.8 <= ratio <= 1.25)
-            varied = robust_std(true[far]) > 0.2 * np.median(true[far]) if len(ratios) else False
+            varied = robust_std(measured[far] - ratio * true[far]) < std if len(ratios) else False  # else an offset is
+            varied = varied and robust_std(true[far]) > 0.2 * np.median(true[far])
             powers = np.log10([ratio, 0.3048 * ratio])
             usual = abs(powers - np.round(powers)).min() < 0.02
             if scaled := other and (varied or usual) and robust_std(ratios) < 0.2 * ratio:
@@ -227,9 +228,9 @@ def of_measurements(c: Check) -> Iterator[str]:
                 f"{verb} off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (
-                    f"offset={','.join(f'{pair}:{off:.3g}' for pair, off, _ in some).replace(' and ', '-')} takes it "
-                    "off."
-                    if word == "range"
+                    f"offset={','.join(f'{i}:{by:.3g}' for i, by, _ in some if ' and ' in i).replace(' and ', '-')} "
+                    "takes it off."
+                    if " to " not in some[0][0]
                     else f"if of all that one measures, offset={some[0][0].split(' to ')[0]}.{word}:{some[0][1]:.3g} "
                     "takes it off (named and in the unit as logged)."
                 )
@@ -254,8 +255,10 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
         one, other = links.observer[rows[0]], links.neighbour[rows[0]]
         off, expected = c.relative[rows, k], c.expected[rows, k]
         less = off - np.median(off)
+        less = wrap(less) if k else less
         lasts = LASTS_STDS * c.fix_noise / (np.maximum(measured[rows], 1.0) if k else 1.0)
-        errors = pd.Series(abs(wrap(less) if k else less) / np.maximum(expected, lasts))
+        lasts = np.where(expected > world.sensors.relative_std[k], lasts, robust_std(np.diff(less)))  # of a truth, none
+        errors = pd.Series(abs(less) / np.maximum(expected, lasts))
         bad = np.flatnonzero(errors.rolling(MEDIAN_WINDOW, 1, center=True).median() > OUTLYING)  # most are too large
         if len(bad) < LEAST_COUNT:
             continue
@@ -276,8 +279,12 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str, float]
 def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
     """Pairs whose measurements of one kind are off by more than PERHAPS errors and a quarter of their noise, with
     medians and their standard errors, largest first: by parts of the drive, and by errors of the filters, which
-    last."""
-    named, lasts, names = [], share(c), pairs(c, k, k > 0)
+    last. Ranges of a pair whose two ends differ by more than `stated` m are those of one of them."""
+    named, lasts, names = [], share(c), pairs(c, k, True)
+    if k == 0:
+        both, usual = pairs(c, 0, False), pd.Series(c.relative[names.index, 0]).groupby(names.to_numpy()).median()
+        least, most = (names.map(usual).groupby(both).transform(each) for each in ("min", "max"))
+        names = names.where(most - least > stated, both)
     for pair, rows in names.groupby(names).groups.items():
         offset, error = median(c.relative[rows, k])
         position = max(float(np.mean(c.expected[rows, k] ** 2)) - stated**2, 0.0)

@@ -198,7 +198,7 @@ class PoseFilter:
         """Poses (R, S, N, 4) at the first step, and where members begin after a gap: NaN where a fix and a compass are,
         else those of `pose_start`; in a fleet NaN where it finds none."""
         there, every = present(recording), [first_poses(recording, self.begin, members)]
-        has_pose = np.isfinite(recording.gnss[..., 0] + body_of(recording).heading).min(axis=0)
+        has_pose = np.isfinite(recording.gnss[..., 0] + body_of(recording).heading).min(0)
         for column in members:
             starts = 1 + np.flatnonzero(there[1:, column] & ~there[:-1, column])
             for again, start in enumerate(starts.tolist(), 1):

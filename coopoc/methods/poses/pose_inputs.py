@@ -45,7 +45,7 @@ def present(recording: Recording) -> Bools:
 
 def fleet_members(recording: Recording) -> list[int]:
     """Columns of all vehicles that are there at some step."""
-    return np.flatnonzero(present(recording).any(axis=0)).tolist()
+    return np.flatnonzero(present(recording).any(0)).tolist()
 
 
 def to_landmarks(recording: Recording, links: Ints) -> Ints:
@@ -136,7 +136,7 @@ def pose_measurements(
     low, high = np.sort(ends, axis=0)
     pair = high * (high - 1) // 2 + low + 1
     fixed = np.isfinite(recording.gnss[:, :, members, 0]).max(axis=(0, 1))  # fixes of both show it
-    pair *= fixed[ends].all(axis=0) & (low >= 0) & (pair <= MOST_PAIRS)
+    pair *= fixed[ends].all(0) & (low >= 0) & (pair <= MOST_PAIRS)
     return PoseMeasurements(
         np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], axis=3)),
         np.ascontiguousarray(present(recording)[:, members]),

@@ -44,11 +44,11 @@ def _next(recording: Recording, waiting: list[int], places: Floats) -> tuple[int
     for column in waiting:
         links = recording.links.of(column)
         marks = to_landmarks(recording, links)
-        whole = np.unique(recording.links.neighbour[marks[np.isfinite(recording.relative[0, marks, :2]).all(axis=1)]])
+        whole = np.unique(recording.links.neighbour[marks[np.isfinite(recording.relative[0, marks, :2]).all(1)]])
         if len(whole) > 1 or np.isfinite(recording.gnss[0, :, column, 0]).any():
             return column, marks
         every.append(links[np.isfinite(places[recording.links.step[links], recording.links.neighbour[links], 0])])
-    most = int(np.argmax([np.isfinite(recording.relative[0, links, :2]).all(axis=1).sum() for links in every]))
+    most = int(np.argmax([np.isfinite(recording.relative[0, links, :2]).all(1).sum() for links in every]))
     return waiting[most], every[most]
 
 
@@ -58,7 +58,7 @@ def _most_likely(recording: Recording, column: int, links: Ints, places: Floats,
     landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
     noise, angles = recording.sensors, HEADING_STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
-        apart, ranges = norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[0, links, 0]
+        apart, ranges = norm(landmarks - landmarks.mean(0), axis=1), recording.relative[0, links, 0]
         filter_ = replace(filter_, assumed=_of_vehicles(noise, np.where(np.isnan(ranges), apart, ranges)))
 
     def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats, Floats]:
@@ -90,9 +90,9 @@ def _back(recording: Recording, column: int, x: Floats, cov: Floats) -> Floats:
     sure = cov[:count, 3, 3] + white
     best = int(np.argmin(sure))
     heading = wrap(x[best, 3] - turns[best])
-    drift = np.square(noise.velocity_std(recording.velocity[0, :count, column, :2], noise.velocity_floor)).sum(axis=-1)
+    drift = np.square(noise.velocity_std(recording.velocity[0, :count, column, :2], noise.velocity_floor)).sum(-1)
     off = np.trace(cov[:count, :2, :2], axis1=1, axis2=2) + recording.dt**2 * np.cumsum(drift)
-    off += np.square(way[:count]).sum(axis=1) * (sure[best] + white / 3.0)
+    off += np.square(way[:count]).sum(1) * (sure[best] + white / 3.0)
     near = int(np.argmin(off))
     return np.append(x[near, :3] - turned(way[near], heading), heading)
 
@@ -127,7 +127,7 @@ def _cost_of_bearings(recording: Recording, column: int, angles: Floats, noise: 
     gap = recording.gnss[0, step, other] - recording.gnss[0, step, column]
     azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _reckoned(recording, column)[0][step]
     residual = wrap(recording.relative[0, links, 1] + angles[:, None] - azimuth)
-    fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
+    fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(1), 1.0)
     cost: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
     return cost
 
@@ -142,7 +142,7 @@ def _hypotheses(recording: Recording, column: int, links: Ints, places: Floats, 
     SEEN_PLACES places, one for each heading, with `places` (L, 3) m of what the links measure."""
     body, relative = body_of(recording), recording.relative[0, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[0, :, column, 0]))
-    complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
+    complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(1))
     turns, way = _reckoned(recording, column)
     compass = body.heading[0, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
@@ -174,7 +174,7 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     (T, 3) m of the tag by odometry."""
     rows = np.flatnonzero(np.isfinite(recording.relative[0, links, 0]))
     at, first = np.unique(places[rows], axis=0, return_index=True)
-    if not len(at) or matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), LINE_WIDTH) < 2:
+    if not len(at) or matrix_rank(at[:, :2] - at[:, :2].mean(0), LINE_WIDTH) < 2:
         actual = f"{recording.ids[column]} has no fix and sees too little in {recording.t[-1] - recording.t[0]:g} s"
         allowed = "a fix, or a range and bearing or three ranges, of landmarks or vehicles whose poses are found"
         raise InputError("seconds", actual, f"must hold {allowed}", "Take more seconds, or give its pose.")
@@ -182,6 +182,6 @@ def _of_ranges(recording: Recording, column: int, links: Ints, places: Floats, a
     early = steps <= steps[first.max()] + RANGE_SECONDS / recording.dt
     rows, steps = rows[early], steps[early]
     centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
-    right = np.square(centres[..., :2]).sum(axis=-1) - recording.relative[0, links[rows], 0] ** 2
+    right = np.square(centres[..., :2]).sum(-1) - recording.relative[0, links[rows], 0] ** 2
     matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
-    return np.column_stack([(pinv(matrix) @ right[..., None])[:, :2, 0], centres[..., 2].mean(axis=1), angles])
+    return np.column_stack([(pinv(matrix) @ right[..., None])[:, :2, 0], centres[..., 2].mean(1), angles])

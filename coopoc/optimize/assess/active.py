@@ -91,7 +91,7 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     from scipy.optimize import lsq_linear
 
     rows = constraint_rows(problem, x)
-    length = np.sqrt(rows.matrix.power(2).sum(axis=1))
+    length = np.sqrt(rows.matrix.power(2).sum(1))
     reach = ACTIVE_STEP * length
     low, high = rows.value - rows.lower <= reach, rows.upper - rows.value <= reach
     equal, touched = rows.lower == rows.upper, np.flatnonzero((low | high) & (length > 0))

@@ -196,7 +196,7 @@ def _marginals(J: Any, still: Bools, gradient: Floats, active: Active) -> tuple[
         unit[i, c] = 1.0
         cov[i, :, c] = solve(unit.ravel()).reshape(shape)[i]
     inflation = own * np.einsum("nii->ni", cov).ravel()
-    moves = exact.power(2).sum(axis=1) > 1e-9
+    moves = exact.power(2).sum(1) > 1e-9
     sound = ((own > 1e-13 * own.max(initial=0.0)) & (inflation > 0) & (inflation < INFLATION))[moves].all()
     return cov, dx, bool(sound)
 
@@ -226,17 +226,17 @@ def _unobservable(
 
     ways = eye_array(J.shape[1], format="csc") if active is None else active.exact
     J = _evened(J @ ways).tocsc()
-    length = np.sqrt(J.power(2).sum(axis=0))
+    length = np.sqrt(J.power(2).sum(0))
     measured = length > 0
     null = _null_rows(J[:, measured], length[measured])
     if bent is None:
         null = null @ ways[:, measured].T
-        moves = np.square(null).sum(axis=0) + ways[:, ~measured].power(2).sum(axis=1)
+        moves = np.square(null).sum(0) + ways[:, ~measured].power(2).sum(1)
         moves = moves * problem.movable.ravel()
     else:
         hessian, scale, flat = bent
         moving = np.flatnonzero(problem.movable)
-        lost, curved = ~measured[moving], abs(hessian).sum(axis=0) > 0
+        lost, curved = ~measured[moving], abs(hessian).sum(0) > 0
         every = np.zeros((J.shape[1], len(null)))
         every[measured] = null.T / length[measured, None]
         own = np.arange(len(moving))[:, None] == np.flatnonzero(lost & curved)
@@ -244,8 +244,8 @@ def _unobservable(
         values, turned = eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
         moves = np.zeros(J.shape[1])
         ways_squared = np.square(basis @ turned)
-        moves[moving] = ways_squared[:, abs(values) <= flat @ ways_squared].sum(axis=1) + (lost & ~curved)
-    moves = moves.reshape(len(problem.names), -1).sum(axis=1)
+        moves[moving] = ways_squared[:, abs(values) <= flat @ ways_squared].sum(1) + (lost & ~curved)
+    moves = moves.reshape(len(problem.names), -1).sum(1)
     return tuple(compress(problem.names, moves > 1e-6))
 
 
@@ -253,7 +253,7 @@ def _evened(J: Any) -> Any:
     """Rows of J (sparse) over their largest number: their weights hide no direction."""
     from scipy.sparse import diags_array
 
-    return diags_array(1.0 / np.maximum(abs(J).max(axis=1).toarray().ravel(), 1e-300)) @ J
+    return diags_array(1.0 / np.maximum(abs(J).max(1).toarray().ravel(), 1e-300)) @ J
 
 
 def _null_rows(J: Any, length: Floats) -> Floats:
@@ -292,8 +292,8 @@ def _seen(J: Any, ways: Floats) -> Bools:
     """
     rows = _evened(J)
     left, terms = abs(rows @ ways), abs(rows) @ abs(ways)
-    matters = terms > 1e-6 * terms.max(axis=0)  # a chain bends by angles that are small beside its length
-    return np.asarray((matters & (left > CANCELLED * terms)).any(axis=0))
+    matters = terms > 1e-6 * terms.max(0)  # a chain bends by angles that are small beside its length
+    return np.asarray((matters & (left > CANCELLED * terms)).any(0))
 
 
 def newton_decrease(problem: Problem, x: Floats) -> float | None:
@@ -439,7 +439,7 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     for factor in problem.factors:
         measured = factor.measured
         if factor.kind in CHORDAL:
-            turned = np.count_nonzero(factor.root[:, :, d:].any(axis=1), axis=1)
+            turned = np.count_nonzero(factor.root[:, :, d:].any(1), axis=1)
             measured = measured - np.maximum(turned - angles, 0)
             matrices += int(np.count_nonzero(turned)) * factor.twice
         count += int(measured.sum())

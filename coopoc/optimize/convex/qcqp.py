@@ -176,7 +176,7 @@ def quadratic(problem: Problem) -> Quadratic:
     if uneven and problem.poses:
         _refuse(uneven[0])
     fixes = [f.z[:, :d] for f in world if f.kind != "displacement"]
-    origin = np.concatenate(fixes).mean(axis=0) if fixes else np.zeros(d)
+    origin = np.concatenate(fixes).mean(0) if fixes else np.zeros(d)
     edges = stacked((f.nodes for f in problem.factors if f.kind == "range"), 2)
     rows = _Rows(problem, bool(uneven), bool(world or problem.fixed), len(edges), origin)
     for factor in problem.factors:

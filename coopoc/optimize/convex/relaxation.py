@@ -48,7 +48,7 @@ class Reduced:
         part = connected_components(free.T @ free, directed=False)[1]
         _, first, label = np.unique(part * width + np.arange(len(part)) % width, return_index=True, return_inverse=True)
         whole = csc_array((np.ones(len(label)), (np.arange(len(label)), label)), shape=(len(label), len(first)))
-        moved, terms = (abs(each).max(axis=0).toarray().ravel() for each in (free @ whole, abs(free) @ whole))
+        moved, terms = (abs(each).max(0).toarray().ravel() for each in (free @ whole, abs(free) @ whole))
         kept = np.ones(self.problem.rows.shape[1], bool)
         kept[bound + first[moved <= 1e-9 * terms]] = False
         return kept

@@ -61,7 +61,7 @@ def check_nodes(measurement: Measurement, nodes: ArrayLike) -> Ints:
         raise InputError("nodes", array.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
     refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
     ordered = np.sort(array)
-    if (same := (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)).any():
+    if (same := (ordered[:, 1:] == ordered[:, :-1]).any(1)).any():
         hint = "A vehicle does not measure itself."
         raise InputError("nodes", array[same][0].tolist(), "must be different points", hint)
     return array
@@ -275,7 +275,7 @@ class Factor:
     def measured(self) -> Ints:
         """(M,) numbers that carry information: the rank of W."""
         if self.std is not None:
-            return np.full(len(self.nodes), np.isfinite(self.std).sum(axis=1))
+            return np.full(len(self.nodes), np.isfinite(self.std).sum(1))
         root, rank = self.root, np.full(len(self.nodes), self.size)
         flat = ~(abs(det(root)) > DEPENDENT_VOLUME * norm(root, axis=2).prod(axis=1))
         if flat.any():  # the rank takes as long as many steps of a solve
@@ -430,8 +430,8 @@ class Constraint:
     @property
     def middle(self) -> Floats:
         """(M, size) that of two bounds of an angle, 0 elsewhere."""
-        both = np.isfinite([self.lower, self.upper]).all(axis=0) & self.measurement.angles(self.dimension or 3)
-        return np.asarray(np.where(both, [self.lower, self.upper], 0.0).mean(axis=0))
+        both = np.isfinite([self.lower, self.upper]).all(0) & self.measurement.angles(self.dimension or 3)
+        return np.asarray(np.where(both, [self.lower, self.upper], 0.0).mean(0))
 
     def __repr__(self) -> str:
         return f"Constraint({self.lower.min()} <= {self.kind} <= {self.upper.max()} x {len(self.nodes)})"

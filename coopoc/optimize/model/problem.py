@@ -362,7 +362,7 @@ def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:
 
 def rows_among(problem: Problem, used: Bools) -> list[Ints]:
     """Of each factor, the rows whose nodes are all used (n,)."""
-    return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in problem.factors]
+    return [np.flatnonzero(used[factor.nodes].all(1)) for factor in problem.factors]
 
 
 def restricted(problem: Problem, used: Bools, x: Floats, rows: Sequence[Ints]) -> Problem:

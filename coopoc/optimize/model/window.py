@@ -76,7 +76,7 @@ def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Fa
 
 def _measured(kind: str, nodes: Ints, z: Floats, std: Floats) -> list[Factor]:
     """The factor of the rows that were measured, if any were."""
-    rows = np.isfinite(z).all(axis=1)
+    rows = np.isfinite(z).all(1)
     return [Factor(kind, nodes[rows], z[rows], std if std.ndim == 1 else std[rows])] if rows.any() else []
 
 

@@ -101,7 +101,7 @@ def crossings(places: Floats, ranges: Floats) -> Floats:
     chosen = np.array([*combinations(few, d)])
     p, r = places[chosen], ranges[chosen]
     gap = p[:, 1:] - p[:, :1]
-    right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
+    right = 0.5 * (np.square(gap).sum(2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
     way, far = gap[:, 0], np.maximum(norm(gap[:, 0], axis=1, keepdims=True), 1e-99)
     if d == 2:  # in a tenth of the time
         foot, off = way / far * right / far, way[:, ::-1] / far * [-1, 1]
@@ -228,7 +228,7 @@ def file(graph: Graph) -> Floats:
     Raises:
         InputError: a vertex without a position.
     """
-    unknown = ~np.isfinite(graph.position).all(axis=1)
+    unknown = ~np.isfinite(graph.position).all(1)
     if unknown.any():
         needs = f"needs a position of {graph.names[int(unknown.argmax())]} in the file"
         raise InputError("start", "'file'", needs, 'Use start="odometry".')
@@ -277,7 +277,7 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
 
 def anchors(graph: Graph) -> Ints:
     """Fixed vertices of which the graph has the place."""
-    return graph.fixed[np.isfinite(graph.position[graph.fixed]).all(axis=1)]
+    return graph.fixed[np.isfinite(graph.position[graph.fixed]).all(1)]
 
 
 def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
@@ -298,8 +298,8 @@ def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools)
 
 def _ranged(graph: Graph, point: int, placed: Bools) -> tuple[Ints, Floats]:
     """The known nodes to which a point has ranges, and these."""
-    rows = np.flatnonzero((graph.ranges.nodes == point).any(axis=1))
-    others = graph.ranges.nodes[rows].sum(axis=1) - point
+    rows = np.flatnonzero((graph.ranges.nodes == point).any(1))
+    others = graph.ranges.nodes[rows].sum(1) - point
     return others[placed[others]], graph.ranges.distance[rows[placed[others]]]
 
 
@@ -350,7 +350,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
 def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Problem, Bools]:
     """The problem from x (n, ambient) of the nodes that are `free` (n,) with their neighbours among the `used`, which
     are fixed, and which nodes it has."""
-    rows = [k[free[f.nodes[k]].any(axis=1)] for f, k in zip(problem.factors, rows_among(problem, used), strict=True)]
+    rows = [k[free[f.nodes[k]].any(1)] for f, k in zip(problem.factors, rows_among(problem, used), strict=True)]
     kept = free.copy()
     for f, own in zip(problem.factors, rows, strict=True):
         kept[f.nodes[own]] = True

@@ -75,7 +75,7 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
     with np.errstate(all="ignore"):
         linear, undefined = linearise(problem.space, items, problem.movable, x), []
     for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
-        bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(axis=2)).any(axis=1)
+        bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(2)).any(1)
         undefined += [(item, item.nodes[bad])] if bad.any() else []
     return undefined
 
@@ -153,7 +153,7 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
         distance, rows = converted_rows([*z.T], np)
         axes = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
         root, z = root @ axes, distance[:, None] * axes[:, 0]
-    information = np.square(root).sum(axis=1) + UNMEASURED_WEIGHT
+    information = np.square(root).sum(1) + UNMEASURED_WEIGHT
     variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
     if factor.measurement.compares_poses:
         z = np.hstack([space.position(z), to_orientation(space.rotation(z))])

@@ -66,14 +66,14 @@ class Ranges(NamedTuple):
         for own, loss in self.losses:
             if loss is not None and (here := own[rows]).any():
                 square[here] = loss.cost(square[here])
-        return np.asarray(0.5 * square.sum(axis=0))
+        return np.asarray(0.5 * square.sum(0))
 
 
 def ranges_of(problem: Problem, x: Floats) -> Ranges:
     """All ranges of a problem that have weight; offsets are those of x (n, ambient)."""
     factors = [f for f in problem.factors if f.kind in RANGES]
     own = np.repeat(np.arange(len(factors)), [len(f.nodes) for f in factors])
-    distance = stacked(f.z[:, 0] - x[f.nodes[:, 2:], 0].sum(axis=1) for f in factors)
+    distance = stacked(f.z[:, 0] - x[f.nodes[:, 2:], 0].sum(1) for f in factors)
     nodes, weight = stacked((f.nodes[:, :2] for f in factors), 2), stacked(f.root[:, 0, 0] for f in factors)
     return Ranges(problem, x, nodes, distance, weight, tuple((own == k, f.loss) for k, f in enumerate(factors)))
 
@@ -94,7 +94,7 @@ def firm(ranges: Ranges) -> Bools:
     problem, x, known = ranges.problem, ranges.x, np.zeros(len(ranges.x))
     for f in problem.factors:
         if f.kind == "position":
-            own = np.square(f.root).sum(axis=1).min(axis=1)
+            own = np.square(f.root).sum(1).min(1)
             own = own if f.loss is None else own * (squared(problem, f, x) <= f.loss.scale**2)
             known += np.bincount(f.nodes[:, 0], own, len(x))
     known[list(problem.fixed)] = inf
@@ -160,11 +160,11 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     square = np.square(shortest_path(table, directed=False))
     if not np.isfinite(square).all():
         return x
-    square -= square.mean(axis=0)
+    square -= square.mean(0)
     values, vectors = eigh(-0.5 * (square - square.mean(axis=1, keepdims=True)))
     y = np.pad(vectors * np.sqrt(np.maximum(values, 0.0)), ((0, 0), (d, 0)))[:, -d:]
     if len(fixed):
-        middle, origin = x[fixed].mean(axis=0), y[anchored].mean(axis=0)
+        middle, origin = x[fixed].mean(0), y[anchored].mean(0)
         left, _, right = svd((x[fixed] - middle).T @ (y[anchored] - origin))
         y = (y - origin) @ (left @ right).T + middle
     mirrored = x.copy()
@@ -179,20 +179,20 @@ def registered(own: Floats, places: Floats, distance: Floats) -> tuple[Floats, F
     References:
         De Leeuw, Applications of convex analysis to multidimensional scaling, 1977 (majorization, which never rises).
     """
-    rng, arms, d = np.random.default_rng(0), own - own.mean(axis=0), own.shape[1]
-    at = places.mean(axis=0) + distance.mean() * rng.normal(size=(REGISTERED, d))
+    rng, arms, d = np.random.default_rng(0), own - own.mean(0), own.shape[1]
+    at = places.mean(0) + distance.mean() * rng.normal(size=(REGISTERED, d))
     turn = nearest_rotation(rng.normal(size=(REGISTERED, d, d)))
     for _ in range(REGISTERED):
         gap = arms @ turn.mT + at[:, None] - places
         to = places + distance[:, None] * gap / norm(gap, axis=2, keepdims=True)
-        at = to.mean(axis=1)
+        at = to.mean(1)
         turn = nearest_rotation(to.mT @ arms)
     return turn, at
 
 
 def mirrored(at: Floats, places: Floats) -> Floats:
     """Points (K, d) reflected at the best-fit plane of places (M, d), which is level where they leave it open."""
-    middle, d = places.mean(axis=0), at.shape[1]
+    middle, d = places.mean(0), at.shape[1]
     gaps = places - middle
     normal = eigh(gaps.T @ gaps + 1e-9 * np.diag(np.arange(d) < 2))[1][:, :1]
     return np.asarray(at - 2.0 * (at - middle) @ normal @ normal.T)
@@ -217,19 +217,19 @@ def _elsewhere(ranges: Ranges, body: Ints, ends: Ints, most: float) -> list[Move
     image = mirrored(at, places)
     met, turn = image[None], nearest_rotation(np.eye(space.dimension)[None])
     if len(body) > 1:
-        turn = nearest_rotation((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))[None]
-        met = (at - at.mean(axis=0)) @ turn[0].T + image.mean(axis=0)[None, None]
+        turn = nearest_rotation((image - image.mean(0)).T @ (at - at.mean(0)))[None]
+        met = (at - at.mean(0)) @ turn[0].T + image.mean(0)[None, None]
         more, to = registered(at[index], places, distance)
         turn = np.concatenate([turn, more])
-        met = np.concatenate([met, (at - at[index].mean(axis=0)) @ more.mT + to[:, None]])
+        met = np.concatenate([met, (at - at[index].mean(0)) @ more.mT + to[:, None]])
     elif len(rows) >= space.dimension:
         met = np.concatenate([met, crossings(places, distance)[:, None]])
         turn = np.repeat(turn, len(met), axis=0)
-    here, away = costs(at[None]), np.asarray(norm(met - at, axis=2).max(axis=1) > least)
+    here, away = costs(at[None]), np.asarray(norm(met - at, axis=2).max(1) > least)
     chosen, adds = list[int](), np.full(len(met), np.nan)
     adds[away] = costs(met[away]) - here
     for k in np.append(0, adds.argsort()).tolist():
-        if adds[k] <= most and (norm(met[k] - met[chosen], axis=2).max(axis=1) > least).all():
+        if adds[k] <= most and (norm(met[k] - met[chosen], axis=2).max(1) > least).all():
             chosen.append(k)
             if len(chosen) == MOST_PLACES:
                 break
@@ -252,7 +252,7 @@ def _moves(ranges: Ranges, loose: list[Ints], anyway: int) -> Iterator[Floats]:
     several = (combinations(near, size) for size in range(2, len(near) + 1))
     together = chain(combinations(single[: max(len(near), anyway)], 1), *several)
     holding, points, space = ranges.nodes[(own < 0) & (own[:, ::-1] >= 0)], stacked(loose), ranges.problem.space
-    if len(holding) and len(points) == len(loose) and (own >= 0).all(axis=1).any():
+    if len(holding) and len(points) == len(loose) and (own >= 0).all(1).any():
         image = mirrored(space.position(x[points]), space.position(x[holding]))
         together = chain([((0.0, space.join(image), points),)], together)
     for chosen in islice(together, MAX_DESCENTS):
@@ -361,7 +361,7 @@ def _windable(space: Space, x: Floats, joined: Sequence[Factor], most: float) ->
     turned = space.rotation(x)
     for f in joined:
         i, j = f.nodes.T
-        v = (d - 1) / (np.square(f.root[:, :, d:]).sum(axis=1).mean(axis=1) + UNMEASURED_WEIGHT)
+        v = (d - 1) / (np.square(f.root[:, :, d:]).sum(1).mean(1) + UNMEASURED_WEIGHT)
         together += v.sum()
         off = log(turned[j].mT @ turned[i] @ space.rotation(f.z))
         error += (np.vecdot(off, off) / v).sum()

@@ -168,7 +168,7 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
     d, at = space.dimension, space.position(x)
     center = np.median(at, axis=0)  # what has gone far away draws nothing there
     spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
-    normal = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][-1]
+    normal = np.linalg.svd(at - at.mean(0), full_matrices=False)[2][-1]
     part = parts(n, *joining(problem))
     poses = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
     held = np.concatenate([np.array(problem.fixed, int), *poses])
@@ -178,7 +178,7 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
         for body in rng.choice(free, 1) if k % 4 == 2 else free:
             own = np.flatnonzero(part == body)
             turn = exp(rng.uniform(-pi, pi, 1)) if d == 2 else Rotation.random(random_state=rng).as_matrix()
-            middle, move, alone = at[own].mean(axis=0), spread * rng.normal(size=d), len(own) == 1
+            middle, move, alone = at[own].mean(0), spread * rng.normal(size=d), len(own) == 1
             to = (center if alone else middle) + move * (k % 4 > 0 or alone)
             to = middle + normal * (move @ normal) if k % 4 == 3 else to
             y[own] = space.join((at[own] - middle) @ turn.T + to, turn @ space.rotation(x[own]))
