@@ -507,7 +507,7 @@ def _unseen(c: Check) -> Iterator[str]:
             yield f"errors, {what} of {blind}"
     late = {row["vehicle"]: row.get("late_s_error", inf) for row in c.vehicles}
     if blind := _below(
-        {who: SURE_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
+        {who: SURE_CLOCK_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
     ):
         yield f"errors, s, of the clocks of {blind}"
     fixes = np.isfinite(c.fix[..., 0]).sum(0)

@@ -30,7 +30,7 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
                 graph.add(i, a, j, b, zero, model)
     if still is not None:
         model = gtsam.noiseModel.Unit.Create(dof)
-        for i in np.flatnonzero(still.any(axis=1)).tolist():
+        for i in np.flatnonzero(still.any(1)).tolist():
             graph.add(i, np.diag(still[i].astype(float)), np.zeros(dof), model)
     for i in range(n):
         nothing.insert(i, np.zeros(dof))

@@ -176,9 +176,9 @@ class Life(NamedTuple):
 def fresh(gnss: Floats, moved: Floats, variance: Floats) -> Floats:
     """Fixes (T, N, 3) but those that repeat the last one of their receiver, whose vehicle has moved."""
     new, last = gnss.copy(), np.full(gnss.shape[1:], nan)
-    moves = np.square(moved).sum(axis=-1) > 0.01 * variance[..., 0]
+    moves = np.square(moved).sum(-1) > 0.01 * variance[..., 0]
     for now, fix, goes in zip(new, gnss, moves, strict=True):
-        now[goes & (fix == last).all(axis=1)] = nan
+        now[goes & (fix == last).all(1)] = nan
         last = np.where(np.isfinite(fix), fix, last)
     return new
 
@@ -734,7 +734,7 @@ class Oracle:
             return 0.0
         apart = np.array([[((x - y) ** 2).sum() - p - q for y, q in errors] for x, p in errors])
         np.fill_diagonal(apart, inf)
-        return float(np.sort(apart.min(axis=1))[(len(errors) - 1) // 2].clip(0) / 3)
+        return float(np.sort(apart.min(1))[(len(errors) - 1) // 2].clip(0) / 3)
 
     def doubt(self, j, tau=TAU):
         """Its fixes have an error of that deviation, m, or none."""

@@ -109,4 +109,4 @@ def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.rand
             x, p = update(mean, cov, fixes[star], relative, new)
             state[k] = (x, p, star)
             error[k, t] = ((x[0] - at[ego]) ** 2).sum()
-    return np.sqrt(error.mean(axis=1))
+    return np.sqrt(error.mean(1))
