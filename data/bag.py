@@ -95,7 +95,6 @@ def read_bag(
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
-    one_of("stamps", stamps, ("header", "received"))
     messages, behind, parts = dict[str, list[tuple[Any, ...]]](), list[float](), dict[str, Rows]()
     folder = path.parent if path.suffix == ".db3" else path
     try:

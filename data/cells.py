@@ -336,7 +336,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
             f"{path.name}: header",
             f"{name[:40]!r} twice",
             "must name one column only",
-            "Rename or remove the other one.",
+            "Rename or remove the other one; write a header, if this is the first row.",
         )
 
 

@@ -88,7 +88,7 @@ def read_tum(path: Path, **options: Any) -> Fleet:
     ids = [file.stem for file, table in zip(files, tables, strict=True) for _ in table]
     t, *x = np.concatenate(tables)[:, :4].T
     source = f"TUM {path.name}, velocity by backward difference"
-    return assemble(ids, t, np.stack(x, axis=1), **options, file=path.name, name=path.stem, source=source)
+    return assemble(ids, t, np.stack(x, 1), **options, file=path.name, name=path.stem, source=source)
 
 
 def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Fleet:

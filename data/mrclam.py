@@ -105,7 +105,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         )
     check_size((end - start) / dt, len(numbers), sum(map(len, truths + wheels)), dt, folder.name)
     t = dt * np.arange(int((end - start) / dt) + 1)
-    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], axis=1)
+    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], 1)
     odometry = np.stack([step_means(Signal(a[:, 0] - start, a[:, 1:]), t) for a in wheels], axis=1)
     file = folder / "Landmark_Groundtruth.dat"
     marks = _read(file, "subject x y x_std y_std")[:, :3] if file.is_file() else np.empty((0, 3))
@@ -251,7 +251,7 @@ def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     finite = np.isfinite(true)
     parts = (np.where(finite, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
     sums = [part.reshape(-1, window, true.shape[1]).sum(1).T for part in parts]
-    pairs = zip(np.stack(sums[1:], axis=-1), sums[0], strict=True)
+    pairs = zip(np.stack(sums[1:], -1), sums[0], strict=True)
     return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
 
 

@@ -243,4 +243,4 @@ def blocks_of(error: Floats, start: int, length: float) -> Floats:
     """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
     size = max(int(length), 1)
     parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
-    return np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()]).T
+    return np.array([np.sqrt(np.nanmean(part**2, 0)) for part in parts if np.isfinite(part).any(axis=0).all()]).T

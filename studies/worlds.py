@@ -154,7 +154,7 @@ def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:
     count = travelled.shape[1]
     along = travelled - np.cumsum(rng.uniform(*gap, count))
     across = 3.5 * rng.integers(0, 2, count) + 0.3 * np.sin(along / 40.0 + rng.uniform(0, 6, count))
-    return turned(np.stack([along, across, rng.uniform(-0.04, 0.04) * along], axis=-1), np.array(rng.uniform(-pi, pi)))
+    return turned(np.stack([along, across, rng.uniform(-0.04, 0.04) * along], -1), np.array(rng.uniform(-pi, pi)))
 
 
 def _platoon(rng: Draws, t: Floats, _: Split) -> Floats:

@@ -269,7 +269,7 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
     def by_hand(made):
         error = np.linalg.norm(made(log.recording, range(1, 5)).x[0] - log.truth.position[:, 1:], axis=2)  # type: ignore[union-attr]
         first = range(0, len(error) - size + 1, size)
-        return float(np.mean([np.sqrt(np.nanmean(error[k : k + size] ** 2, axis=0)) for k in first]))
+        return float(np.mean([np.sqrt(np.nanmean(error[k : k + size] ** 2, 0)) for k in first]))
 
     fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=TRUE_POSE_STD, assumed=noise)
     assert whole["rt_le_m"][0] == pytest.approx(by_hand(fleet), abs=2e-4)

@@ -201,6 +201,11 @@ def test_anchors_elsewhere_are_named_and_no_scale_is(tmp_path, wrong):
     )
 
 
+def test_understated_ranges_are_named_without_a_truth(tmp_path):
+    (strange(tmp_path, "drone", seconds=60) / "truth.csv").unlink()
+    assert re.search(r"scatter more than stated.*std=range:0\.(1|09)", said(tmp_path, "std=range:0.03"))
+
+
 def test_a_hundred_anchors_are_read_without_a_word(tmp_path):
     """pandas warned of frames with more than a hundred columns, once for each of them."""
     rng, t = default_rng(2), np.arange(0, 40, 0.5)
@@ -231,7 +236,7 @@ def test_a_receiver_that_loses_its_base_is_named(tmp_path):
 def test_odometry_of_one_that_errs_is_no_clock_of_others(tmp_path, pace, factor, words):
     rng, t, k = default_rng(5), np.arange(0, 150, 0.2), np.arange(4)[:, None]
     u = pace * (1 + 0.25 * np.sin(0.08 * t + k)) * np.exp(1.2j * np.sin(0.07 * t + 0.3 * k))
-    x = 0.2 * np.cumsum(u, axis=1) - 0.1 * u + 9j * k
+    x = 0.2 * np.cumsum(u, 1) - 0.1 * u + 9j * k
     u[1] *= factor
     ways = dict(zip("abcd", x, strict=True))
     pd.concat([star(t, rng, name, ways, own, ways[name]) for name, own in zip("abcd", u, strict=True)]).to_csv(

@@ -56,7 +56,7 @@ def test_clients_have_the_papers_lengths_and_speeds():
     assert fleet.present.sum(0).tolist() == [1550, 4600, 1450, 1420]
     assert (np.diff(fleet.present.astype(int), axis=0) <= 0).all(), "present from the start, absent after the end"
     speed = norm(fleet.velocity, axis=2)
-    ranges = np.c_[np.nanmin(speed, axis=0), np.nanmax(speed, axis=0)]
+    ranges = np.c_[np.nanmin(speed, 0), np.nanmax(speed, 0)]
     np.testing.assert_allclose(ranges, [[8.9, 10.8], [9.2, 10.9], [0.7, 10.7], [3.6, 10.7]], atol=0.6)
     words = in_words(card("town10-clients"))
     assert [words[f"speed of {k}"] for k in (1, 4)] == ["8.6..10.9 m/s", "3..10.6 m/s"]

@@ -155,7 +155,7 @@ def test_innovations_are_filterpys(folders):
         assert squares[0, t, 0] == pytest.approx(kf.y @ kf.SI @ kf.y / 3, rel=1e-6)
     columns = innovation_columns(track, rec)
     assert columns["fixes"].tolist() == [[199.0]]
-    assert columns["nis"] == pytest.approx(np.nanmean(squares, axis=1))
+    assert columns["nis"] == pytest.approx(np.nanmean(squares, 1))
 
 
 def test_the_check_finds_nothing_wrong_but_what_was_left_out(folders):

@@ -95,7 +95,7 @@ def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_sta
         made = co.PoseFilter("fleet", lasting=True, gate=5.0, begin=begin)
         track = made(thinned(seen, landmarks, 3000), log.fleet.ids)
         squares = np.square(track.x[0, 3000:7500] - log.fleet.position[3000:7500]).sum(-1)
-        assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), axis=1)).mean() < most
+        assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), 1)).mean() < most
 
 
 def test_first_poses_are_found_from_what_is_seen(log, seen):

@@ -24,7 +24,7 @@ def convoy(vehicles: int = 4, steps: int = 150, dt: float = 0.1) -> Fleet:
     t = dt * np.arange(steps)
     velocity = np.broadcast_to([10.0, 2.0, 0.0], (steps, vehicles, 3)).copy()
     velocity[:, 1:2, 1] += (np.where((t > 4) & (t < 8), 12.0, 0.0) - np.where((t > 8) & (t < 12), 12.0, 0.0))[:, None]
-    position = np.cumsum(dt * velocity, axis=0) + 12.0 * np.arange(vehicles)[:, None] * [1.0, 0.5, 0.0]
+    position = np.cumsum(dt * velocity, 0) + 12.0 * np.arange(vehicles)[:, None] * [1.0, 0.5, 0.0]
     return Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, velocity)
 
 

@@ -70,7 +70,7 @@ def test_a_method_of_ones_own_beside_others(folder):
         name = f"{row['max_neighbours']}-alpha.py_Alpha-nominal-{row['ego']}-run{row['run']}.tum"
         path = np.loadtxt(folder / "runs/side_by_side/tracks" / name)[:, 1:4]
         error = path - fleet.position[:, fleet.index(row["ego"])]
-        assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(row["rt_le_m"], rel=1e-6)
+        assert np.sqrt(np.mean(np.sum(error**2, 1))) == pytest.approx(row["rt_le_m"], rel=1e-6)
     alpha, *_, bound = re.findall(r"^\| (\S.*?) +\|(?: [a-z]+ +\|)? +\**([\d.]+)\**", table, flags=re.MULTILINE)[:4]
     assert (alpha[0], bound[0]) == ("alpha", "Cramér-Rao bound")
     assert float(alpha[1]) > float(bound[1])

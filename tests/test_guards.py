@@ -79,7 +79,7 @@ def test_a_filter_is_back_within_five_seconds_of_the_end_of_an_attack(method, dt
     less than one deviation more than without them, and was ten."""
     t = np.arange(0.0, 80.0, dt)
     velocity = np.stack([8.0 + 4.0 * np.sin(t / 4), 3.0 * np.cos(t / 4), 0.0 * t], axis=-1)[:, None]
-    drive = Fleet(("a",), t, np.cumsum(dt * velocity, axis=0), velocity)
+    drive = Fleet(("a",), t, np.cumsum(dt * velocity, 0), velocity)
     recording = observe(drive, Sensors(gnss_std=(1.5,) * 3, velocity_std_ratio=0.1), V2X(0), runs=20)
     off = 15.0 * ((t >= 20.0) & (t < 50.0))[:, None, None] * [1.0, 0.0, 0.0]
     gap = method(replace(recording, gnss=recording.gnss + off)).x - method(recording).x

@@ -33,7 +33,7 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale, priors):
     """filterpy: of the positions along a straight road one filter knows no scale error, one has it as a state; their
     estimates by Bayes' rule."""
     t = 0.5 * np.arange(120)
-    position = np.stack([8.0 * t, 0 * t, 0 * t], axis=-1)[:, None]
+    position = np.stack([8.0 * t, 0 * t, 0 * t], -1)[:, None]
     fleet = Fleet(("a",), t, position, np.broadcast_to([8.0, 0, 0], position.shape))
     seen = observe(fleet, replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
     seen = replace(seen, velocity=seen.velocity * (1 + scale))

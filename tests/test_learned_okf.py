@@ -36,7 +36,7 @@ def test_recovers_the_share_of_the_velocity():
     """Known: 10 % of each velocity component (the "axis" reading of the paper's training noise)."""
     t = np.arange(8100) / 10
     velocity = np.stack([9 * np.cos(t / 9), 9 * np.sin(t / 9), 4 * np.cos(t / 5)], axis=-1)[:, None]
-    (client,) = clients(Fleet(("a",), t, np.cumsum(0.1 * velocity, axis=0), velocity), Sensors.paper_training())
+    (client,) = clients(Fleet(("a",), t, np.cumsum(0.1 * velocity, 0), velocity), Sensors.paper_training())
     found = fit_okf(client.training, client.validation, steps=150)[0].method("okf")
     assert_allclose(found.velocity_ratio, 0.1, rtol=0.2)
     assert_allclose(found.gnss_std, 1.5, rtol=0.05)
@@ -46,7 +46,7 @@ def test_equals_filterpy():
     """Where fixes are missing, too; so do the estimates and innovations that are trained."""
     method = OptimisedKF((0.1, 0.2, 0.05), (0.1, 0.05, 0.0), (1.5, 2.0, 0.7))
     velocity = np.random.default_rng(0).normal(0, 8, (50, 1, 3))
-    rec = holed(observe(Fleet(("a",), np.arange(50) / 10, np.cumsum(0.1 * velocity, axis=0), velocity), Sensors()), 0.5)
+    rec = holed(observe(Fleet(("a",), np.arange(50) / 10, np.cumsum(0.1 * velocity, 0), velocity), Sensors()), 0.5)
     rec = replace(rec, velocity=rec.velocity[:, [0, 0, *range(2, 50)]])  # the pace of a piece begins at its first step
     track = method(rec)
     given = (torch.tensor(a[0, 1:, None]) for a in (rec.gnss, rec.velocity, rec.gnss))

@@ -123,7 +123,7 @@ def drive(seed: int, vehicles: int = 2, steps: int = 4) -> Problem:
     rng = default_rng(seed)
     t = 0.5 * np.arange(steps)[:, None]
     x, y = 14.0 * t - 20.0 * np.arange(vehicles), 0.0 * t + np.zeros(vehicles)
-    truth = np.stack([x, y, road(x, y)], axis=-1)
+    truth = np.stack([x, y, road(x, y)], -1)
     names = [[f"v{v}@{s}" for v in range(vehicles)] for s in range(steps)]
     flat = tuple(n for row in names for n in row)
     moved = [(a, b) for now, then in pairwise(names) for a, b in zip(now, then, strict=True)]
@@ -381,7 +381,7 @@ def test_vehicles_between_kerbs_end_as_low_as_from_the_truth(loss):
     """Fixes of 15 m, ranges of 0.3 m, many minima; without an x0, and from one that is far off."""
     rng = default_rng(0)
     truth = np.stack([rng.uniform(-30, 30, 6), rng.uniform(-4, 4, 6)], axis=1)
-    pairs = rng.permutation(np.stack(np.triu_indices(6, 1), axis=1))[:10]
+    pairs = rng.permutation(np.stack(np.triu_indices(6, 1), 1))[:10]
     ranges = norm(truth[pairs[:, 0]] - truth[pairs[:, 1]], axis=1) + rng.normal(0, 0.3, 10)
     problem = Problem(tuple("abcdef"), dimension=2).add("range", pairs, ranges, std=0.3, loss=loss)
     problem = problem.add("position", range(6), truth + rng.normal(0, 15, (6, 2)), std=15.0)

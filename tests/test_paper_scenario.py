@@ -43,6 +43,6 @@ def test_an_independent_simulation_gives_the_published_errors(most):
     fleet = co.load_fleet("town10")
     draws = [np.random.default_rng([most, ego]) for ego in range(0, 60, 12)]
     errors = [simulate(fleet.position, fleet.velocity, 12 * k, most, rng) for k, rng in enumerate(draws)]
-    for found, (method, noise_model) in zip(np.mean(errors, axis=0), METHODS, strict=True):
+    for found, (method, noise_model) in zip(np.mean(errors, 0), METHODS, strict=True):
         mean, std = published(most, method, noise_model)
         assert abs(found - mean) < 4.0 * std + 0.005 * mean, (method, found, mean, std)

@@ -27,7 +27,7 @@ def convoy(vehicles: int = 5, steps: int = 200, masts: int = 0) -> co.Fleet:
     course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * np.arange(vehicles))
     velocity = 10 * np.stack([np.cos(course), np.sin(course), 0 * course], axis=2)
     start = np.c_[8.0 * np.arange(vehicles), 3.0 * (np.arange(vehicles) % 2), 0.0 * np.arange(vehicles)]
-    position = start + np.cumsum(0.1 * velocity, axis=0)
+    position = start + np.cumsum(0.1 * velocity, 0)
     fleet = co.Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, velocity)
     return with_masts(fleet, np.arange(masts)[:, None] * [60.0, 0.0, 0.0] + [0.0, 12.0, 4.0])
 

@@ -143,7 +143,7 @@ def test_a_late_fix_is_nearly_used_up():
     is itself as good as it says; without the late fixes a filter is clearly worse."""
     draw = default_rng(5)
     errors = np.array([window(draw, 60, 3, q=0.1, r=3.5) for _ in range(150)])
-    ours, best, without, _ = np.sqrt(np.mean(errors**2, axis=0))
+    ours, best, without, _ = np.sqrt(np.mean(errors**2, 0))
     assert best == pytest.approx(errors[0, 3], rel=0.2)
     assert ours < 1.02 * best
     assert without > 1.1 * best
@@ -177,7 +177,7 @@ def test_the_motion_that_is_kept_is_its_integral():
     dt = np.concatenate([rng.uniform(0.2, 0.9, 100), rng.uniform(0.01, 0.05, 500), rng.uniform(0.2, 0.9, 50)])
     moved, variance = rng.normal(size=(len(dt), 3)), rng.uniform(size=(len(dt), 3))
     end, sums = np.append(0.0, np.cumsum(dt)), np.zeros((len(dt) + 1, 6))
-    sums[1:] = np.cumsum(np.hstack([moved, variance]), axis=0)
+    sums[1:] = np.cumsum(np.hstack([moved, variance]), 0)
     for k, step in enumerate(dt, start=1):
         history.push(step, moved[k - 1], variance[k - 1])
         seen = history.rows[0, 2]

@@ -221,7 +221,7 @@ def drive(gap: tuple[float, float, float] = (9.0, 0.0, 0.0), steps: int = 80) ->
     """Two vehicles on a bend, the second `gap` m from the first."""
     t = 0.1 * np.arange(steps)
     velocity = np.c_[5 * np.cos(0.2 * t), 5 * np.sin(0.2 * t), 0 * t]
-    position = np.cumsum(0.1 * velocity, axis=0)[:, None] + np.arange(2)[:, None] * np.array(gap)
+    position = np.cumsum(0.1 * velocity, 0)[:, None] + np.arange(2)[:, None] * np.array(gap)
     return co.Fleet(("a", "b"), t, position, np.repeat(velocity[:, None], 2, axis=1))
 
 

@@ -313,7 +313,7 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
     (forward, _), dt, d = body_motion(fleet), fleet.dt, 4 + len(lasting)
     heading = midway(true_heading(fleet))
     moved, shape = dt * turned(forward, heading), heading.shape
-    aside = np.stack([-moved[..., 1], moved[..., 0], np.zeros(shape)], axis=-1)
+    aside = np.stack([-moved[..., 1], moved[..., 0], np.zeros(shape)], -1)
     motion, noise = np.zeros((*shape, d, d)), np.zeros((*shape, d, d))
     motion[...] = np.eye(d)
     motion[..., :3, 3] = aside
@@ -392,7 +392,7 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     measured of range, azimuth and inclination."""
     away, azimuth, inclination = spherical(*edges.vector.T)
     flat = np.maximum(np.hypot(*edges.vector[:, :2].T), MIN_GROUND_DISTANCE)
-    gradients = directions(azimuth, inclination) / np.stack([np.ones_like(away), flat, away], axis=1)[..., None]
+    gradients = directions(azimuth, inclination) / np.stack([np.ones_like(away), flat, away], 1)[..., None]
     weight = np.square(std) ** -1.0 * edges.measured
     return np.asarray(gradients.mT @ (weight[..., None] * gradients))
 

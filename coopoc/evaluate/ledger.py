@@ -104,7 +104,7 @@ def of_training(
     overhead = number("overhead", overhead, 0, 10**9, kind=int, allowed=">= 0 bytes")
     count = (len(names),)
     payload = np.array([checked("sent", sent, "(V,)", count), checked("received", received, "(V,)", count)])
-    moved = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]
+    moved = np.stack([payload, payload + overhead * checked("messages", messages)], 1)[:, :, None]
     return Ledger(tuple(names), np.zeros(len(names)), moved[0], moved[1], tuple(servers))
 
 

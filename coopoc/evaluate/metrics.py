@@ -178,7 +178,7 @@ def pose_covariance(track: Track) -> Floats:
 METRICS: Mapping[str, Callable[[Track, Fleet], Floats]] = {
     "rt_le_m": rt_le,
     "max_error_m": max_error,
-    "nees": lambda track, fleet: np.nanmean(nees(track, fleet), axis=1),
+    "nees": lambda track, fleet: np.nanmean(nees(track, fleet), 1),
 }
 """Column of a table -> function of a Track and its Fleet; a unit that is not SI stands in the name."""
 

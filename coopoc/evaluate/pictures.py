@@ -209,7 +209,7 @@ def pairs(ax: "Axes", first: Floats, second: Floats, color: str, label: str | No
     """Lines between points (n, 2) and points (n, 2) m."""
     from matplotlib.collections import LineCollection
 
-    lines = np.stack([first, second], axis=1)
+    lines = np.stack([first, second], 1)
     lines = lines[np.isfinite(lines).all(axis=(1, 2))]
     dense = float(np.clip(np.sqrt(300 / max(len(lines), 1)), 0.08, 1.0))  # of thousands each is nearly transparent
     ax.add_collection(LineCollection(list(lines), colors=color, linewidths=width, alpha=dense, zorder=2.5, label=label))

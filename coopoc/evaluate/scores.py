@@ -89,14 +89,14 @@ def scored(
             made[metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
             each = nees(track, drive, method=method.name)
-            made["nees"] = np.nanmean(each, axis=1)
+            made["nees"] = np.nanmean(each, 1)
             squares.append(each.sum(0))
         parts.append(made)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
     more: dict[str, Any] = {"seconds": seconds / recording.runs / served}
     if squares:
-        more["nees_inside"] = share_of_average(np.sum(squares, axis=0) / recording.runs, recording.runs)
+        more["nees_inside"] = share_of_average(np.sum(squares, 0) / recording.runs, recording.runs)
     return {**{name: np.broadcast_to(value, columns["left_fixes"].shape) for name, value in more.items()}, **columns}
 
 

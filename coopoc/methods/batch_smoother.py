@@ -175,7 +175,7 @@ def counted(recording: Recording, active: Bools) -> Bools:
         names = f"without {[recording.ids[c] for c in silent[:4]]}"
         raise InputError("observers", names, "must be all vehicles here", "Leave observe(..., observers=...) out.")
     links, arrival = recording.links, recording.arrival
-    ends = np.sort([links.observer, links.neighbour], axis=0)
+    ends = np.sort([links.observer, links.neighbour], 0)
     _, pair = np.unique(np.stack([links.step, *ends]), axis=1, return_inverse=True)
     arrives = (arrival >= 0) & (arrival - links.step <= recording.v2x.max_age / recording.dt + 1e-9)
     heard = np.zeros((len(links), recording.runs), bool)

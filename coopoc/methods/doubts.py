@@ -59,7 +59,7 @@ def doubts(
     fix[1] = fix[1].sum()
     every = max(min(round(JUDGED_SECONDS / recording.dt), steps // JUDGED_IN_A_ROW), 1)
     marks = np.zeros((3, len(egos), steps), int)
-    fixes = np.stack(np.broadcast_arrays(recording.fix_scale**2 * fix[0], fix[1]), axis=2)
+    fixes = np.stack(np.broadcast_arrays(recording.fix_scale**2 * fix[0], fix[1]), 2)
     doubtful = mark_estimates(recording.gnss, x, claimed, egos, fixes, every, marks)
     doubtful += DOUBT * (neighbours is not None)
     noted = [any(note.startswith(NOTE.format(recording.ids[ego])) for note in earlier) for ego in columns]
@@ -79,7 +79,7 @@ def doubts(
         if neighbours is not None and len(claimed):
             own, far = links.of(ego), np.zeros((2, len(recording.ids), steps), int)
             theirs, first = neighbours[:, first : first + len(own)], first + len(own)
-            rows = np.stack([own, links.step[own], links.neighbour[own]], axis=1)
+            rows = np.stack([own, links.step[own], links.neighbour[own]], 1)
             std = np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std])
             star = recording.gnss, recording.relative, x[:, :, k], claimed[:, :, k], theirs, rows
             mark_neighbours(*star, fixes, std, 2 * every, far)

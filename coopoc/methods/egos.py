@@ -72,7 +72,7 @@ def follow_egos(
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = clock() - began
-    whole = {name: np.concatenate(values, axis=-1) for name, values in extras.items()}
+    whole = {name: np.concatenate(values, -1) for name, values in extras.items()}
     late = absent if absent.any() and not needs_fix(method) else None
     counted = received, sent, seconds, neighbours, notes
     return Track(recording.t, tuple(columns), x, cov, *counted, extras=whole, ids=recording.ids, absent=late)

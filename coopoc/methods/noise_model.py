@@ -323,7 +323,7 @@ def _offsets(recording: Recording, noise: Sensors) -> Iterator[str]:
     """A note on each pair of a log whose ranges are off by fixes of both at one step, by more than these scatter:
     methods of positions have no state for that."""
     links, ranges = recording.links, recording.relative[0, :, 0]
-    ends = np.sort([links.observer, links.neighbour], axis=0)
+    ends = np.sort([links.observer, links.neighbour], 0)
     one, other = recording.gnss[0][links.step, ends]
     off = ranges - np.linalg.norm(other - one, axis=1)
     for pair in np.unique(ends, axis=1).T if recording.measured else ():

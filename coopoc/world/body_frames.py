@@ -44,7 +44,7 @@ def turned(vector: Floats, angle: Floats) -> Floats:
     [0.0, 1.0, 2.0]
     """
     (x, y, z), cos, sin = np.moveaxis(vector, -1, 0), np.cos(angle), np.sin(angle)
-    return np.stack(np.broadcast_arrays(cos * x - sin * y, sin * x + cos * y, z), axis=-1)
+    return np.stack(np.broadcast_arrays(cos * x - sin * y, sin * x + cos * y, z), -1)
 
 
 def midway(heading: Floats) -> Floats:
@@ -55,7 +55,7 @@ def midway(heading: Floats) -> Floats:
     >>> midway(np.array([[0.0], [1.0], [np.nan]])).ravel().tolist()
     [0.0, 0.5, nan]
     """
-    before = np.concatenate([heading[..., :1, :], heading[..., :-1, :]], axis=-2)
+    before = np.concatenate([heading[..., :1, :], heading[..., :-1, :]], -2)
     return np.asarray(heading - wrap(heading - np.where(np.isnan(before), heading, before)) / 2)
 
 
@@ -164,7 +164,7 @@ def in_body(relative: Floats, fleet: Fleet, links: Links, turned: Floats) -> Flo
 def _normals(fleet: Fleet, sensor: str, at: tuple[int, int], *size: int) -> Floats:
     """(T, N, ...) standard normals, a stream per vehicle."""
     draws = [stream(at[0], sensor, at[1], name).standard_normal((len(fleet.t), *size)) for name in fleet.ids]
-    return np.stack(draws, axis=1)
+    return np.stack(draws, 1)
 
 
 def _lasting(fleet: Fleet, sensor: str, std: float, sensors: Sensors, at: tuple[int, int], *size: int) -> Floats:

@@ -125,7 +125,7 @@ class Fleet:
 
 
 def _check_gaps(fleet: Fleet) -> None:
-    numbers = np.concatenate([fleet.position, fleet.velocity], axis=2)
+    numbers = np.concatenate([fleet.position, fleet.velocity], 2)
     bad = np.isinf(numbers).any(axis=2) | (np.isnan(numbers).any(axis=2) & ~np.isnan(numbers).all(axis=2))
     if bad.any():
         step, vehicle = np.argwhere(bad)[0]

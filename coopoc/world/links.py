@@ -148,7 +148,7 @@ def directions(azimuth: Floats, inclination: Floats) -> Floats:
     """
     sa, ca, si, ci = np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination)
     rows = [[si * ca, si * sa, ci], [-sa, ca, 0.0 * sa], [ci * ca, ci * sa, -si]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.stack([np.stack(row, axis=-1) for row in rows], -2)
 
 
 def stretches(flags: Bools) -> list[tuple[int, int]]:

@@ -415,10 +415,10 @@ def _contradicting(recording: Recording) -> float:
     heading = np.zeros(u.shape)
     turned = heading
     if body is not None:
-        heading, turned = body.heading[0], np.cumsum(np.nan_to_num(body.yaw_rate[0]), axis=0) * recording.dt
+        heading, turned = body.heading[0], np.cumsum(np.nan_to_num(body.yaw_rate[0]), 0) * recording.dt
     path = np.cumsum(np.nan_to_num(u * np.exp(1j * turned)), axis=0) * recording.dt
     newest, column = last_true(np.isfinite(fixes))[::lag], np.arange(u.shape[1])
-    ends = (values[newest, column] for values in (fixes, path, np.cumsum(np.isnan(u), axis=0)))
+    ends = (values[newest, column] for values in (fixes, path, np.cumsum(np.isnan(u), 0)))
     moved, driven, gaps = (np.diff(values, axis=0) for values in ends)
     turn = np.exp(1j * (heading - turned))[newest[:-1], column]
     moved, driven = np.where(np.isnan(turn), (abs(moved), abs(driven)), (moved, driven * turn))

@@ -192,11 +192,11 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, remove_outliers:
     for r in range(runs):
         if high > 0:
             bias = [stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3)) for name in fleet.ids]
-            fixes[r] += np.stack(bias, axis=1)
+            fixes[r] += np.stack(bias, 1)
         for std, names in ((sensors.gnss_drift_std, fleet.ids), (sensors.gnss_common_std, ("",))):
             if std > 0:  # the common error belongs to no vehicle
                 draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
-                fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
+                fixes[r] += std * gauss_markov(np.stack(draws, 1), fleet.dt / sensors.gnss_drift_time)
     if sensors.outliers:
         wrong_fixes(fixes, fleet, sensors.outliers, seed, remove_outliers)
     return fixes
@@ -215,7 +215,7 @@ def _relative_measurements(
 ) -> Floats:
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
-    exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
+    exact = np.stack(spherical(*vector.T), -1) if len(links) else np.empty((0, 3))
     pairs, relative = _pairs(fleet.ids, links), np.empty((runs, *exact.shape))
     turned = _own_errors(fleet, links, sensors, runs, seed, *HEADING)
     longer = _own_errors(fleet, links, sensors, runs, seed, "range_offset")
@@ -265,7 +265,7 @@ def schedule(ids: Sequence[str], t: Floats, links: Links, v2x: V2X, runs: int, s
     sent = sends[links.step, links.neighbour]
     arrival = np.where(sent, links.step + int(np.ceil(v2x.latency / dt - 1e-9)), -1)[None].repeat(runs, axis=0)
     if v2x.loss > 0:
-        number = (np.cumsum(sends, axis=0) - 1)[links.step, links.neighbour]
+        number = (np.cumsum(sends, 0) - 1)[links.step, links.neighbour]
         for observer, neighbour, pair, _ in _pairs(ids, links):
             index = pair[sent[pair]]
             size = int(number[index].max(initial=-1)) + 1
@@ -405,7 +405,7 @@ def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, fl
         gap = norm(everyone - right[:, None], axis=-1)
         gap[~((away >= reach[0]) & (away <= reach[1]))] = inf  # of absent vehicles, too
         gap[rows, neighbour] = gap[rows, observer] = inf
-        other = np.argmin(gap, axis=1)
+        other = np.argmin(gap, 1)
         done[part] = np.isfinite(gap[rows, other])
         angles = (np.stack(spherical(*(to - own).T)[1:], axis=-1) for to in (everyone[rows, other], right))
         error[part] = np.where(done[part, None], next(angles) - next(angles), 0.0)

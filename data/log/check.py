@@ -223,7 +223,7 @@ def _noisier(c: Check, column: int) -> str:
     """When fixes scatter far more than is stated and than they do else: second differences of what they are beside the
     odometry, which slips hardly change; nothing where none do."""
     rec, t = c.world, c.world.t - c.world.t[0]
-    path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, axis=0)
+    path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, 0)
     off = pd.DataFrame((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[[0, 1]].dropna()
     size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / (c.fix_noise * (6 * np.log(2)) ** 0.5)
     scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated

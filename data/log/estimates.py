@@ -338,7 +338,7 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     made, then = made_by(velocity), made_by(following(c, velocity))
     which = which[used]
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
-    pairs = np.sort([links.observer, links.neighbour], axis=0)
+    pairs = np.sort([links.observer, links.neighbour], 0)
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
     x, z, groups = made[0][there], then[0][there], (pairs[0] * size + pairs[1])[there]
     value, error = no_estimate(size + 2)

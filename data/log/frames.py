@@ -262,7 +262,7 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
         noise["velocity_bias_std"] = VELOCITY_BIAS_STD * ("vy_body" in used)
-    derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], axis=0).tolist()
+    derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], 0).tolist()
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of(HEADING_STD, "rad", "heading")
     elif derived and "bearing" in used:

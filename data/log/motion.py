@@ -432,7 +432,7 @@ def _held(fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bo
     """(M,) fixes that are as the one before (`again`), though what moves has gone on by their standard deviation."""
     nearest, _ = steps.nearest(fixes.t)
     moves = there & (norm(velocity, axis=1) > STANDS)
-    way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
+    way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, 0)[nearest]
     return np.asarray(again & there[nearest] & (norm(way - way[last_true(~again)], axis=1) > std))
 
 

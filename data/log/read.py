@@ -188,6 +188,7 @@ def read_log(
     path, body = given_path(path), frame == "body"
     summary, offset = Summary(path.name), named("offset", offset or {}, "Give offset={name: number}.")
     one_of("frame", frame, Frame)
+    one_of("stamps", stamps, Stamps)
     texts("ignore", ignore)
     instance("any_scale", any_scale, bool, "Give True or False.")
     instance("mutual", mutual, bool, "Give True or False.")

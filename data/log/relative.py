@@ -49,8 +49,9 @@ OUTLIER_SHARE, LEAST_OUTLIERS = 0.01, 3
 """Share of measurements beyond 5 standard deviations that is reported, if these are more than several."""
 LASTS_STDS = 0.6
 """Standard deviations of two fixes by which receivers may be off for long, over OUTLYING."""
-MEDIAN_WINDOW = 9
-"""Measurements of a pair whose median is taken off to count outliers."""
+MEDIAN_WINDOW, WANDER = 9, 3.0
+"""Measurements of a pair whose median is taken off to count outliers; variance about it of a random walk from one to
+the next, over the share of its variance that the drive keeps."""
 PLACE_ERRORS, GAUSS_NEWTON = 6.0, 4
 """Standard errors from which a member stands elsewhere; steps that find where."""
 WRONG_SHARE, NAMED_CASES, MISFITS = 0.8, 4, 500
@@ -192,8 +193,8 @@ def of_measurements(c: Check) -> Iterator[str]:
                 )
         k = list(UNITS).index(name)
         misfits = _misfits(c, k)
-        apart = {(" to " if k else " and ").join(ends) for pair in misfits for ends in (pair, pair[:: 1 if k else -1])}
-        pairs = [one for one in _named(c, k, least) if one[0] not in apart]
+        apart = {one.join(ends) for pair in misfits for ends in (pair, pair[::-1]) for one in (" to ", " and ")}
+        named = [one for one in _named(c, k, least) if one[0] not in apart]
         if outliers > max(OUTLIER_SHARE, LEAST_OUTLIERS / number) and not scaled and not misfits:
             yield (
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
@@ -220,7 +221,7 @@ def of_measurements(c: Check) -> Iterator[str]:
                 "position or clock, or a value that is held."
             )
         for verb in ["are"] * (not wrong or hint == HINTS["range"]) + [MAY] * (not wrong):
-            some = [one for one in pairs if (abs(one[1]) > SURE_ERRORS * one[2]) == (verb != MAY)]
+            some = [one for one in named if (abs(one[1]) > SURE_ERRORS * one[2]) == (verb != MAY)]
             if not some:
                 continue
             yield (
@@ -235,7 +236,8 @@ def of_measurements(c: Check) -> Iterator[str]:
                     "takes it off (named and in the unit as logged)."
                 )
             )
-        if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):
+        position *= min(WANDER * pairs(c, k, False).nunique() / (number * max(share(c), MIN_STD_SHARE)), 1.0) ** 0.5
+        if not wrong and not NARROW_RATIO * least < noise < WIDE_RATIO * np.hypot(least, position):  # which lasts
             known = "assumed" if name in "".join(c.log.summary.assumed.get(UNSTATED, ())) else "stated"
             yield (
                 f"{word}s scatter {'less' if noise < least else 'more'} than {known}, by {noise:.2g} {unit} from one "

@@ -213,7 +213,7 @@ def plane(vectors: Floats) -> AnyArray:
 
 def in_space(plane: AnyArray) -> Floats:
     """Vectors (..., 3) of x + iy, with the height 0, NaN where there is none."""
-    return np.stack([plane.real, plane.imag, 0.0 * plane.real], axis=-1)
+    return np.stack([plane.real, plane.imag, 0.0 * plane.real], -1)
 
 
 def distances(gap: Floats) -> list[Floats]:

@@ -154,7 +154,7 @@ class PoseFilter:
         if self.unit == "solo":
             begin = self._begins(recording, columns)
             alone = [self._run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
-            x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*alone, strict=True))[:2])
+            x, cov = (np.concatenate(parts, 2) for parts in list(zip(*alone, strict=True))[:2])
             theirs, world = _seen(recording, columns, x, []), _in_world(recording, columns, x)
         else:
             members = fleet_members(recording)
@@ -209,7 +209,7 @@ class PoseFilter:
                     if not has_pose[start, column] and len(part.t) > 1:
                         one = PoseFilter("solo", gate=START_GATE)
                         every[again][:, column] = likely_poses(part, one, [column])[:, column]
-        return np.stack(every, axis=1)
+        return np.stack(every, 1)
 
     def start(self, dt: float, begin: Floats | None = None) -> PoseStream:
         """This filter for a vehicle alone that is fed as it drives, one `step` of dt s after the other.

@@ -75,7 +75,7 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
         )
     radians("headings of begin", begin_poses[..., 3])
     poses = np.ascontiguousarray(np.broadcast_to(begin_poses, shape))
-    first = np.concatenate([recording.gnss[:, 0], body_of(recording).heading[:, 0, :, None]], axis=2)
+    first = np.concatenate([recording.gnss[:, 0], body_of(recording).heading[:, 0, :, None]], 2)
     lacking = np.isnan(first) & np.isnan(poses) & np.isfinite(recording.velocity[:, 0, :, :1])
     for column in columns:
         if lacking[:, column].any():
@@ -133,12 +133,12 @@ def pose_measurements(
     number[list(members)] = np.arange(len(members))
     own = [recording.gnss, body.heading[..., None], recording.velocity, body.yaw_rate[..., None]]
     relative, ends = recording.relative[:, links], number[[table.observer[links], table.neighbour[links]]]
-    low, high = np.sort(ends, axis=0)
+    low, high = np.sort(ends, 0)
     pair = high * (high - 1) // 2 + low + 1
     fixed = np.isfinite(recording.gnss[:, :, members, 0]).max(axis=(0, 1))  # fixes of both show it
     pair *= fixed[ends].all(0) & (low >= 0) & (pair <= MOST_PAIRS)
     return PoseMeasurements(
-        np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], axis=3)),
+        np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], 3)),
         np.ascontiguousarray(present(recording)[:, members]),
         np.column_stack([*ends, pair]),
         np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),

@@ -105,7 +105,7 @@ def _reckoned(recording: Recording, column: int, scale: float = 0.0, bias: float
     turns = np.cumsum(dt * rate)
     moved = turned(dt / (1.0 + scale) * recording.velocity[0, :, column], turns - 0.5 * dt * rate)
     moved[0] = 0.0
-    return turns, np.cumsum(moved, axis=0)
+    return turns, np.cumsum(moved, 0)
 
 
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
