@@ -74,10 +74,12 @@ def no_estimate(count: int) -> Estimate:
     return Estimate(np.zeros(count), np.full(count, inf))
 
 
-def factors(y: AnyArray, x: Any, noise: float, groups: Ints | None = None, z: Any = None) -> Estimate:
+def factors(
+    y: AnyArray, x: Any, noise: float, groups: Ints | None = None, z: Any = None, parts: int = DRIVE_PARTS
+) -> Estimate:
     """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, less the means of groups (M,);
-    and standard errors, as leaving out each part of the drive changes them. None is known where half of y stays, and
-    that is OUTLYING times its noise: something else is wrong.
+    and standard errors, as leaving out each of some parts of the drive changes them. None is known where half of y
+    stays, and that is OUTLYING times its noise: something else is wrong.
 
     The instruments z (M, k), x itself if not given, are causes without the noise that is in both x and y. Both may be
     sparse.
@@ -119,7 +121,7 @@ def factors(y: AnyArray, x: Any, noise: float, groups: Ints | None = None, z: An
     before, left = (float(np.median(gap_of(factor))) for factor in (0.0 * value, value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    count = min(DRIVE_PARTS, max(len(y) // 2, min(len(y), FEW_PARTS)))
+    count = min(parts, max(len(y) // 2, min(len(y), FEW_PARTS)))
     changes = value - np.stack(
         [fitted(at * count // len(y) != part) for part in progress_bar(range(count), "check", delay=2.0)]
     )
@@ -342,7 +344,8 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
     noise = np.median(c.expected[there, 0]) if there.any() else 0.0
     x, z, groups = made[0][there], then[0][there], (pairs[0] * size + pairs[1])[there]
     value, error = no_estimate(size + 2)
-    value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z)
+    parts = 2 if reference is None else DRIVE_PARTS  # to find one takes no errors
+    value[which], error[which] = factors(c.relative[there, 0], x, noise, groups, z, parts)
     measured = np.unique(pairs[:, there])
     stay = max(noise**2 - world.sensors.range_std**2, 0.0) * share(c) / np.where(which < size, 2, len(measured) or 1)
     varied = np.maximum(less_means(x, groups).power(2).sum(0), 1e-12) / np.maximum((x != 0.0).sum(0), 1)
