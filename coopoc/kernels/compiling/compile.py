@@ -115,9 +115,9 @@ def _made(function: Function, liberties: set[str], part: bool = False, **options
 
         _watch()
     if hooks := _hooks():
-        options["pipeline_class"] = hooks[0].Part if part else hooks[0].Kernel
+        options |= {"pipeline_class": hooks[0].Part if part else hooks[0].Kernel, "no_cfunc_wrapper": True}
         if part:
-            options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
+            options |= {"no_cpython_wrapper": True, "_nrt": False}
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
 
 

@@ -14,11 +14,6 @@ from typing import Any
 from .vectors import Number, Numbers, unrolled
 
 
-def order(matrix: Numbers) -> int:
-    """d of a d x d matrix."""
-    return math.isqrt(len(matrix))
-
-
 def _entries(rows: int, columns: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(rows) for j in range(columns)]
 
@@ -108,7 +103,7 @@ def choose_each(sign: Any, a: Any, b: Any) -> Any:
 @unrolled
 def transpose(a: Any) -> Any:
     """A^T."""
-    d = order(a)
+    d = math.isqrt(len(a))
     return [a[j * d + i] for i, j in _entries(d, d)]
 
 
@@ -134,14 +129,16 @@ def add_diagonal(a: Any, v: Any) -> Any:
 @unrolled
 def minus_product(a: Any, b: Any) -> Any:
     """-A B, B a matrix or a vector."""
-    d, m = order(a), len(b) // order(a)
+    d = math.isqrt(len(a))
+    m = len(b) // d
     return [_dot(-(a[i * d] * b[j]), a[i * d + 1 : i * d + d], b[m + j :: m]) for i, j in _entries(d, m)]
 
 
 @unrolled
 def less_transposed_product(t: Any, a: Any, b: Any) -> Any:
     """T - A^T B, B a matrix or a vector."""
-    d, m = order(a), len(b) // order(a)
+    d = math.isqrt(len(a))
+    m = len(b) // d
     return [_dot(t[i * m + j], a[i::d], b[j::m]) for i, j in _entries(d, m)]
 
 

@@ -259,7 +259,14 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> Lanes:
     low, high, going = 0.0 * w + MIN_OWN_WEIGHT, 0.0 * w + MAX_WEIGHT, 0.0 * w + 1.0
     w = choose(w - MAX_WEIGHT, high, w)
     for round_ in range(NEWTON_STEPS):
-        first, second = derivatives(fusion, fixed, n, w)
+        total, dp_dw, d2p_dw2 = fixed, scale(fixed, 0.0), scale(fixed, 0.0)
+        for k in range(n):
+            information, derivative, curvature = source(fusion, k, w if k == 0 else 1.0 - w)
+            total, d2p_dw2 = add(total, information), add(d2p_dw2, curvature)
+            dp_dw = add(dp_dw, derivative) if k == 0 else subtract(dp_dw, derivative)
+        p = inverse(total)
+        twice, bent = product(p, p), add(product(product(dp_dw, p), dp_dw), d2p_dw2)
+        first, second = -inner_product(twice, dp_dw), 2.0 * inner_product(twice, transpose(bent))  # of tr P by w
         low, high = choose(first, low, w), choose(-first, high, w)
         newton = choose(second, w - first / second, w)
         inside_low, inside_high = newton - low, high - newton
@@ -270,20 +277,6 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> Lanes:
         if going <= 0.0 * w:
             break
     return choose(w - MAX_WEIGHT + STEP_TOLERANCE, 0.0 * w + 1.0, w)
-
-
-@inner
-def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float, float]:
-    """First and second derivative of tr P by w."""
-    total, dp_dw, d2p_dw2 = fixed, scale(fixed, 0.0), scale(fixed, 0.0)
-    for k in range(n):
-        information, derivative, curvature = source(fusion, k, w if k == 0 else 1.0 - w)
-        total, d2p_dw2 = add(total, information), add(d2p_dw2, curvature)
-        dp_dw = add(dp_dw, derivative) if k == 0 else subtract(dp_dw, derivative)
-    p = inverse(total)
-    twice = product(p, p)
-    d2p_dw2 = add(product(product(dp_dw, p), dp_dw), d2p_dw2)
-    return -inner_product(twice, dp_dw), 2.0 * inner_product(twice, transpose(d2p_dw2))
 
 
 @inside
