@@ -83,7 +83,7 @@ def winding(steps: int = 60, speed: float = 8.0, period: float = 3.0, vehicles: 
     t = np.arange(steps) / 10
     wave = t[:, None] / period + np.arange(vehicles)
     velocity = speed * np.stack([np.cos(wave), np.sin(wave), 0.03 * np.cos(wave)], axis=-1)
-    return Fleet(tuple("abcdefgh"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
+    return Fleet(tuple("abcdefgh"[:vehicles]), t, np.cumsum(0.1 * velocity, 0), velocity)
 
 
 def moving(letter: str, t: Floats, position: Floats) -> Fleet:
@@ -134,7 +134,7 @@ def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
 def with_masts(fleet: Fleet, places: Any) -> Fleet:
     """And landmarks m0, m1, ... at (M, 3) m."""
     stand = np.broadcast_to(places, (len(fleet.t), *np.shape(places)))
-    position, velocity = (np.append(a, b, axis=1) for a, b in ((fleet.position, stand), (fleet.velocity, 0 * stand)))
+    position, velocity = (np.append(a, b, 1) for a, b in ((fleet.position, stand), (fleet.velocity, 0 * stand)))
     return Fleet((*fleet.ids, *(f"m{k}" for k in range(len(places)))), fleet.t, position, velocity)
 
 

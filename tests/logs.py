@@ -16,10 +16,10 @@ def drive(vehicles: int = 4, steps: int = 200, dt: float = 0.1, start: float = 0
     t = dt * np.arange(steps)
     course = 0.4 * np.sin(0.15 * t)
     step = dt * 8 * np.c_[np.cos(course), np.sin(course), 0 * t]
-    path = np.cumsum(step, axis=0)
+    path = np.cumsum(step, 0)
     aside = gap * np.arange(vehicles)[:, None] * [0.2, 1.0, 0.0]
     position = path[:, None] + aside
-    velocity = np.repeat(step[:, None] / dt, vehicles, axis=1)
+    velocity = np.repeat(step[:, None] / dt, vehicles, 1)
     return Fleet(tuple(f"car{k}" for k in range(vehicles)), start + t, position, velocity)
 
 
@@ -114,8 +114,8 @@ def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
     course = 2.5 * np.sin(0.1 * t)
     velocity = np.c_[8 * np.cos(course), 8 * np.sin(course), 0.1 * climb * np.cos(0.1 * t)]
     apart = 12.0 * np.arange(vehicles)[:, None] * [0.3, 0.9, 0.0]
-    position = np.cumsum(0.02 * velocity, axis=0)[:, None] + apart
-    return Fleet(tuple(f"car{k}" for k in range(vehicles)), t, position, np.repeat(velocity[:, None], vehicles, axis=1))
+    position = np.cumsum(0.02 * velocity, 0)[:, None] + apart
+    return Fleet(tuple(f"car{k}" for k in range(vehicles)), t, position, np.repeat(velocity[:, None], vehicles, 1))
 
 
 def outliers(values: Any, share: float = 0.05) -> Any:

@@ -102,7 +102,7 @@ def test_wrong_ranges_cost_little_and_are_named():
     assert weights[changed].mean() < 0.1
     assert weights[~changed].mean() > 0.97
     white = default_rng(0).normal(size=(4, 1000, 3))
-    twice = np.repeat(white, 2, axis=1)
+    twice = np.repeat(white, 2, 1)
     assert lasting("a", white, 1.0) == lasting("a", twice, 0.5) == []
     assert "correlated by 0.5" in lasting("a", twice, 1.0)[0]
 

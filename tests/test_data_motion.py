@@ -96,7 +96,7 @@ def test_one_filter_of_the_bank_is_filterpys():
     interval = float(np.median(np.diff(t)))
     velocity, *_ = constant_velocity(t, z, interval, 9.0, std**2, 10.0, np.full(7, w))
     assert_allclose(velocity, filtered(t, z, std, (w / interval) ** 4 * std**2)[1], atol=1e-9)
-    t, x = 5.0 * np.arange(200), 5 * np.cumsum(rng.normal(0, 2, (200, 3)), axis=0).cumsum(axis=0)
+    t, x = 5.0 * np.arange(200), 5 * np.cumsum(rng.normal(0, 2, (200, 3)), 0).cumsum(0)
     proved = constant_velocity(t, x + rng.normal(0, std, x.shape), 5.0, 9.0, std**2, 10.0, BANK)[3]
     assert proved[9:].min() > 0.2 * std**2  # where gains near 1 fit any noise, that of fixes is as stated
 

@@ -31,7 +31,7 @@ def convoy(vehicles: int = 4, steps: int = 150, dt: float = 0.1) -> Fleet:
 def test_gauss_markov_has_the_stated_correlation():
     """Closed form: variance 1 and correlation exp(-k / 20) at k steps."""
     error = gauss_markov(np.random.default_rng(0).standard_normal((400, 3000)), 1 / 20)
-    assert error.var(axis=1) == pytest.approx(np.ones(400), abs=0.15)
+    assert error.var(1) == pytest.approx(np.ones(400), abs=0.15)
     for lag in (1, 20, 60):
         assert (error[lag:] * error[:-lag]).mean() == pytest.approx(np.exp(-lag / 20), abs=0.02)
 

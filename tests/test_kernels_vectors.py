@@ -53,7 +53,7 @@ def test_blocks_against_numpy(batched):
     d, size, rng = 3, 3 * BLOCKS, default_rng(3)
     root = rng.normal(size=(size, size))
     a, eta, process = root @ root.T + np.eye(size), rng.normal(size=size), rng.uniform(0.1, 1.0, size)
-    shape = (lambda v: np.repeat(v[:, None], LANES, axis=1)) if batched else np.copy
+    shape = (lambda v: np.repeat(v[:, None], LANES, 1)) if batched else np.copy
     memory = shape(np.zeros(2 * BLOCKS * d**2))
     mine, right = shape(blockwise(a, d)), shape(eta)
     solved(mine, right, memory)

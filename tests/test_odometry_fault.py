@@ -88,7 +88,7 @@ def test_odometry_that_errs_a_little(fault, every, beside):
     wrong = np.array([-0.6, -0.5, 0.0]) if ships else u * (t % 60 < 10)[:, None, None]
     velocity = np.broadcast_to(u - wrong * ships, (1800, 2, 3))
     wrong = np.where((t[:, None, None] > 900) & (fault == "stands"), -velocity, wrong)
-    fleet = co.Fleet(("a", "b"), t, velocity.cumsum(axis=0) + np.array([[0.0] * 3, [0.0, 40.0, 0.0]]), velocity)
+    fleet = co.Fleet(("a", "b"), t, velocity.cumsum(0) + np.array([[0.0] * 3, [0.0, 40.0, 0.0]]), velocity)
     std, floor, ranges = (30.0 if fault == "noisy" else 3.0, 0.05, 5.0) if ships else (0.5, 0.05, 0.1)
     sensors = co.Sensors(gnss_std=(std,) * 3, velocity_std_ratio=0.0, velocity_floor=floor, range_std=ranges)
     seen = slow_fixes(observe(fleet, sensors, V2X(beside, radius=100.0), runs=4), every)

@@ -69,7 +69,7 @@ def test_predictions_are_those_of_dense_algebra():
     whole = problem.whiten(x)[1].toarray()
     size = problem.factors[0].size
     rows: Ints = (size * np.array(candidate[1])[:, None] + np.arange(size)).ravel()
-    known = np.delete(whole, rows, axis=0)
+    known = np.delete(whole, rows, 0)
     moving = np.flatnonzero(abs(whole).sum(0))
     P = inv((known.T @ known)[np.ix_(moving, moving)])
     for k, row in enumerate(candidate[1]):

@@ -65,7 +65,7 @@ def ranged() -> tuple[Fleet, Recording]:
     t = 0.5 * np.arange(200)
     ego = np.stack([8 * t, 3 * np.sin(0.05 * t), 0 * t], -1)
     around = np.stack([25 * np.cos(0.03 * t), 4 + 20 * np.sin(0.03 * t), 0 * t], axis=-1)
-    x = np.stack([ego, ego + around, np.stack([8 * t - 15, 0 * t - 12, 0 * t], axis=-1)], 1)
+    x = np.stack([ego, ego + around, np.stack([8 * t - 15, 0 * t - 12, 0 * t], -1)], 1)
     velocity = np.diff(x, axis=0, prepend=x[:1]) / 0.5
     velocity[0] = velocity[1]
     fleet = Fleet(("ego", "around", "behind"), t, x, velocity)

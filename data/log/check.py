@@ -42,7 +42,7 @@ from .estimates import (
     worst,
 )
 from .motion import HOLDS, OTHER_RATES
-from .read import Log
+from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
 from .residuals import Check, filtered, without, without_wild
 
@@ -75,7 +75,7 @@ USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold"
 """Beginnings of reasons that are no fault of the log."""
-FAULTS = "stamps of", "fixes far from", OTHER_RATES.split("{")[0]
+FAULTS = "stamps of", "fixes far from", SEVERAL.split("{")[0], OTHER_RATES.split("{")[0]
 """Beginnings of what is assumed that is a fault."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {

@@ -65,6 +65,8 @@ READERS: Mapping[str, Callable[..., Rows]] = {
 entry."""
 TRUTH_NAME = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 """Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
+SEVERAL = "fixes of {} come from files side by side: of several antennas, or one is the truth, which truth= names"
+"""What is assumed of two files with fixes of one vehicle."""
 SPARSE_SECONDS = 0.5
 """s between samples of a truth from which straight lines between them are not the path; within so many s of a sample
 the curve through all counts as truth."""
@@ -231,6 +233,10 @@ def read_log(
     summary.rows = int((rows["true"] == 0).sum())
     rows, true_rows = not_vague(rows[rows["true"] == 0], summary), rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
+    spans = only(rows, "x").groupby(["vehicle", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
+    for name, span in spans.groupby("vehicle"):
+        if (span["min"] < span["max"].cummax().shift()).any():
+            summary.assume(SEVERAL, f"{name} ({', '.join(sorted(span['file']))})")
     deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
