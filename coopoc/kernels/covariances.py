@@ -98,7 +98,8 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
 @inside
 def squared(gap: Numbers, variance: Numbers) -> float:
     """Squared normalised difference."""
-    return inner_product(times(gap, gap), over(variance))
+    total: float = inner_product(times(gap, gap), over(variance))
+    return total
 
 
 @compiled

@@ -111,7 +111,8 @@ def gate_fix(state: Floats, moved: Vector, process: Vector, fix: Vector, noise: 
         store(state, P, spread)
         state[HITS] = 0.0
         return 1.0
-    return inflation(q, gate, hits)
+    factor: float = inflation(q, gate, hits)
+    return factor
 
 
 @inside
