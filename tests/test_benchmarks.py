@@ -152,7 +152,8 @@ def test_parameters_are_chosen_on_other_drives_and_draws():
         assert (task.name, task.sensors, task.v2x) == (other.name, other.sensors, other.v2x)
         assert task.seed != other.seed
     used = {co.load_fleet(task.data).digest for task in TASKS}
-    assert not used & {co.load_fleet(name).digest for name in ("town10-validation", "town10-clients")}
+    chosen = {co.load_fleet(name).digest for name in ("town10-validation", "town10-clients")}
+    assert not used & chosen
     assert {task.data for task in VALIDATION} == {"town10-validation"}
 
 
@@ -180,7 +181,8 @@ def test_the_cards_method_is_scored_as_by_hand(short, tmp_path):
 
 def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short, tmp_path, capsys):
     (tmp_path / "mine.py").write_text(OWN)
-    assert benchmark.benchmark((f"{tmp_path / 'mine.py'}:Own",), out=tmp_path) == 1
+    name = f"{tmp_path / 'mine.py'}:Own"
+    assert benchmark.benchmark((name,), out=tmp_path) == 1
     assert re.search(r'mine\.py", line \d+, in __call__\n.*\n +ValueError: neighbours', capsys.readouterr().err)
     (file,) = tmp_path.glob("*.json")
     card = json.loads(file.read_text())

@@ -70,7 +70,8 @@ def parsed(argv: list[str]) -> tuple[str, dict[str, Any]]:
     def arguments(*given, **options):
         return dict(bind(*given, **options).arguments)
 
-    return " ".join(names), tyro.cli(arguments, prog="coopoc", args=argv, config=(tyro.conf.FlagCreatePairsOff,))
+    made = tyro.cli(arguments, prog="coopoc", args=argv, config=(tyro.conf.FlagCreatePairsOff,))
+    return " ".join(names), made
 
 
 @pytest.fixture(scope="module")

@@ -197,7 +197,8 @@ def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it():
     _assert_gtsam_agrees(graph, factors, values, {f"A{k}": k for k in range(20)}, atol=1e-5)  # six-digit quaternions
     seen = [factors.at(k) for k in range(factors.size()) if "BearingRange" in type(factors.at(k)).__name__]
     assert len(seen) == len(graph.relative_point) == 80
-    assert_allclose(norm(graph.relative_point.position, axis=1), [f.measured().range() for f in seen], atol=1e-12)
+    distance = [f.measured().range() for f in seen]
+    assert_allclose(norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
 
 
 def test_a_graph_cannot_be_changed_and_lists_its_robots():

@@ -133,7 +133,8 @@ def test_gnc_that_rejects_every_measurement_is_reported():
 
 
 def test_a_limit_of_rounds_is_a_status(monkeypatch):
-    problem = Problem([*"a"]).add("position", ["a"] * 12, np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0]), std=1.0)
+    z = np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0])
+    problem = Problem([*"a"]).add("position", ["a"] * 12, z, std=1.0)
     monkeypatch.setattr(graduated, "MAX_ROUNDS", 2)
     with pytest.raises(SolveError) as caught:
         solve_gnc(problem, [0])

@@ -74,7 +74,8 @@ def test_the_file_is_checked_before_it_is_kept(tmp_path, monkeypatch):
 
 
 def test_the_card_travels_along(file, shipped):
-    assert json.loads({p.key: p.value for p in onnx.load(file).metadata_props}["card"]) == dict(shipped.card)
+    props = {p.key: p.value for p in onnx.load(file).metadata_props}
+    assert json.loads(props["card"]) == dict(shipped.card)
 
 
 def test_the_file_names_its_arrays_and_no_machine(file):

@@ -267,7 +267,8 @@ def test_the_text_of_an_error_stays_in_the_client(tmp_path, capsys):
     lines[7] = lines[7].rpartition(",")[0] + ",8361947.125x"
     (tmp_path / "drive.csv").write_text("\n".join(lines))
     message = Message(RecordDict({"config": ConfigRecord({"server-round": 1})}), 1, "train")
-    reply = client_app()(message, Context(1, 1, {"data": str(tmp_path / "drive.csv")}, RecordDict(), TINY))
+    context = Context(1, 1, {"data": str(tmp_path / "drive.csv")}, RecordDict(), TINY)
+    reply = client_app()(message, context)
     assert "8361947" in capsys.readouterr().err
     assert "8361947" not in str(reply.error)
     assert "in the client, see its own log" in str(reply.error.reason)

@@ -92,7 +92,8 @@ def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
         own = [c for c in job_clients(job, fleet) if c.name not in row["absent"].keys() | row["rejected"].keys()]
         trained = adapt(untrained(job), before, own, job.setting.seed, row["round"], plan.rounds, plan.local)
         fitted = [made.weights.numpy() for made in trained.values()]
-        mean = np.average(np.stack(fitted).astype(float), axis=0, weights=[len(client.training) for client in own])
+        sizes = [len(client.training) for client in own]
+        mean = np.average(np.stack(fitted).astype(float), axis=0, weights=sizes)
         assert theta.numpy() == pytest.approx(mean, abs=1e-6)
     return found.card
 

@@ -57,7 +57,8 @@ def test_window_chains_who_stays(recording):
         (before, s), (after, t) = problem.names[i].split("@"), problem.names[j].split("@")
         assert before == after
         assert int(t) == int(s) + 1
-        assert z == pytest.approx(recording.dt * recording.velocity[0, int(t), recording.ids.index(after)])
+        column = recording.ids.index(after)
+        assert z == pytest.approx(recording.dt * recording.velocity[0, int(t), column])
     stays = sum(name.split("@")[0] + f"@{int(name.split('@')[1]) - 1}" in problem.names for name in problem.names)
     assert len(moved.nodes) == stays
     assert problem.names[problem.shown] == "c0@20"
@@ -269,6 +270,7 @@ def test_what_is_missing_is_no_factor(incomplete, noise):
 
 @pytest.mark.parametrize("poses", [(), (1,), (0, 2)])
 def test_a_point_among_poses_has_no_rotation_to_move(poses):
-    problem = Problem([*"abc"], x0=pose(np.zeros((3, 2))) if poses else np.zeros((3, 2)), dimension=2, poses=poses)
+    x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
+    problem = Problem([*"abc"], x0=x0, dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)
     assert problem.movable.sum(1).tolist() == wanted.tolist()

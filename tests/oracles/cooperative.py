@@ -35,7 +35,6 @@ from coopoc.kernels.stars.cooperative_messages import (
     FADES,
     FAULTY_SHARE,
     FIX_SCORE,
-    LEAST,
     PENALTY,
     REVOKE_LOG_ODDS,
     TRUST_LOG_ODDS,
@@ -300,7 +299,8 @@ class Oracle:
         s.late += self.dt
         if s.share < 1:
             return
-        error, keep = self.fix[t] - sum([b.x[b.at(*name)] for name in self.fix_terms(self.ego)]), exp(-min(s.late, 1.0))
+        states = [b.x[b.at(*name)] for name in self.fix_terms(self.ego)]
+        error, keep = self.fix[t] - sum(states), exp(-min(s.late, 1.0))
         if s.weight:
             s.products = [*s.products, (t, error @ s.recent / s.weight)]
         s.recent, s.weight, s.late = keep * s.recent + error, keep * s.weight + 1, 0.0
@@ -495,9 +495,10 @@ class Oracle:
         if s.unused == t:
             fix[:] = nan
         seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix)
-        again = bool(g.fix_gate) and t > s.began and seen and (outvoted or self.lost())
-        if again:
-            self.start(t, fix)
+        if outvoted:
+            s.trusted.add(self.ego)
+        again = bool(g.fix_gate) and t > s.began and seen
+        again = again and (outvoted or self.lost(t)) and self.start(t, fix)
         for j in list(s.members):
             if j not in others or again or self.contradicted(t, j):
                 self.dismiss(j, j in others, outvoted)
@@ -542,7 +543,7 @@ class Oracle:
             self.take(t, j)
         if g.fix_gate:
             self.trust()
-            self.follow_majority()
+            self.doubt_ego()
         self.corrected()
         if g.forget:
             step = np.clip(s.learned / (s.information + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
@@ -658,12 +659,12 @@ class Oracle:
         judged = j != self.ego or any(i in s.last for i in s.members)
         doubtful = g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows))
         if doubtful:
-            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= -FIX_GATE / 2
+            supported = j != self.ego or self.speak_for(t, b.x[b.at("x", j)], z) >= 0
             if supported and j in s.trusted:
                 s.revoked[j] = s.revoked.get(j, 0) + 1
             elif not supported:
                 b.noise(("x", j), np.square(z - h @ b.x).sum() / 3)
-            self.doubt(j, max(TAU, float(norm(z - h @ b.x))) if supported else 0.0)
+            self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
                 s.agreed = s.agreed if s.jumped else 0.0
@@ -697,7 +698,7 @@ class Oracle:
     def wrong(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """On average, or locked out, the ego beside a neighbour that is trusted."""
         locked = q > self.priors.fix_gate and self.state.locked.get(j, 0.0) >= PATIENCE
-        return (j != self.ego or self.trusted() > 0) and (self.wrong_on_average(j, q, gap, cov, r) or locked)
+        return self.wrong_on_average(j, q, gap, cov, r) or (locked and (j != self.ego or self.trusted() > 0))
 
     def trusted(self) -> int:
         """How many members are trusted, of those that have sent a message."""
@@ -717,9 +718,8 @@ class Oracle:
         near = mean @ solve(v, mean)
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
         v = v + (self.usual(j) if j != self.ego else 0.0) * np.eye(3)
-        wide = v + min(TAU**2, mean @ mean / 3) * np.eye(3)
-        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, wide)
-        return bool(count >= LEAST and enough and odds < -REVOKE_LOG_ODDS)
+        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
+        return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
 
     def usual(self, but=-1) -> float:
         """Variance of an error of fixes that nothing is wrong with: of those of the others the lower median distance
@@ -746,10 +746,11 @@ class Oracle:
             if variance:
                 s.belief.add(("b", j), 0.0, variance)
 
-    def follow_majority(self):
-        """More that err alike than are trusted, the ego's own among them, or most: the ego goes where they see it."""
-        s, b, own = self.state, self.state.belief, self.ego not in self.state.trusted
-        if not own and (s.trusted != {self.ego} or {*s.revoked} - {self.ego}):
+    def doubt_ego(self):
+        """Where none was ever trusted, but most err alike, the ego errs: it goes where they see it."""
+        s, b = self.state, self.state.belief
+        heard = [j for j in s.members if j in s.last]
+        if len(heard) < 2 or s.trusted != {self.ego} or {*s.revoked} - {self.ego}:
             return
 
         def far(j, k=None) -> float:
@@ -760,28 +761,24 @@ class Oracle:
             gap = b.x[at] - two * b.x[to]
             return float(gap @ solve(v, gap))
 
-        heard = [j for j in s.members if j in s.last]
-        early = [self.ego, *(j for j in heard if s.agreed <= 0 or j not in s.revoked)]
-        wrong = [j for j in early if j not in s.trusted and far(j) > WILD]
-        alike = {j: [k for k in wrong if k == j or far(j, k) < FIX_GATE] for j in wrong}
-        best = max([self.ego][: self.ego in wrong] if own else wrong, key=lambda j: len(alike[j]), default=None)
-        if best is None or len(alike[best]) < 2:
-            return
-        if len(alike[best]) <= self.trusted() + 1 if own else 2 * len(alike[best]) <= len(heard):
+        alike = {j: [k for k in heard if k == j or far(j, k) < FIX_GATE] for j in heard}
+        best = max([j for j in heard if far(j) > WILD], key=lambda j: len(alike[j]), default=None)
+        if best is None or 2 * len(alike[best]) <= len(heard) or len(alike[best]) < 2:
             return
         x, e = b.at("x", self.ego), b.at("b", best)
         there, spread = b.x[x] + b.x[e], np.trace(b.p[x, x] + b.p[e, e] + 2 * b.p[x, e]) / 3
-        before = [self.ego, *s.members]
         for j in list(s.members):
             self.dismiss(j, True, False)
         s.way.clear()
+        s.trusted |= {*alike[best]}
+        for j in alike[best]:
+            s.mean.pop(j, None)
         self.place(there, spread)
-        for j in before:
-            s.revoked.update({j: s.revoked.get(j, 0) + 1} if j in s.trusted and j not in alike[best] else {})
-            self.doubt(j, 0.0 if j in alike[best] else TAU)
+        self.doubt(self.ego)
+        s.revoked[self.ego] = s.revoked.get(self.ego, 0) + 1
         s.left, s.agreed, s.hits[self.ego] = None, 0.0, 0
 
-    def start(self, t, fix: Floats):
+    def start(self, t, fix: Floats) -> bool:
         """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""
         s, g = self.state, self.priors
         places, votes = self.places(t, fix), [1]
@@ -789,6 +786,8 @@ class Oracle:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
         elsewhere = np.isnan(fix[0]) or (votes[0] <= 1 and max(votes) >= 2)
+        if self.ego not in s.trusted and votes[0] < max(len(votes), 2):
+            return False
         self.place(places[best if elsewhere else 0][0], FLAT)
         s.joined[self.ego], s.hits[self.ego] = t, 0
         if s.left:
@@ -799,6 +798,7 @@ class Oracle:
         if elsewhere:
             fix[:], s.unused = nan, t
             s.vague.discard(self.ego)
+        return True
 
     def place(self, x: Floats, variance: Any):
         """The ego anew, whose fixes are trusted."""
@@ -856,14 +856,20 @@ class Oracle:
             found.append(min(float(q), FIX_GATE))
         return found
 
-    def lost(self) -> bool:
+    def lost(self, t) -> bool:
         s = self.state
-        return (
-            not self.trusted()
-            and self.ego in s.trusted
-            and s.hits[self.ego] > 0
-            and s.locked.get(self.ego, 0.0) >= PATIENCE
-        )
+        held = [j for j in s.members if j in s.last]
+        if self.trusted():
+            return False
+        if self.ego in s.trusted:
+            return bool(s.hits[self.ego] > 0 and s.locked.get(self.ego, 0.0) >= PATIENCE)
+        if s.agreed > 0:
+            return False
+        b, noise = s.belief, (self.r[t, self.ego] @ self.white) / 3
+        error = b.x[b.at("b", self.ego)]
+        apart = [float(np.square(error - b.x[b.at("b", j)]).sum()) for j in held]
+        agree = error @ error > FIX_GATE * noise and apart[:1] < [FIX_GATE * noise]
+        return len(held) >= 2 or bool(len(held) == 1 and (error @ error > WILD * noise or agree))
 
     def contradicted(self, t, j) -> bool:
         hits, since = self.state.hits[("relative", j)], t - self.state.joined[j]
@@ -1076,7 +1082,8 @@ class Oracle:
         if old:
             before = last.mean[c] + moved[c]
             z = before + (z - before) * weight / (weight - old)
-            way = (steps - 1 / steps) / 12 if follows else min((steps - 1) * (2 * steps - 1) / (6 * steps), long)
+            full = (steps - 1) * (2 * steps - 1) / (6 * steps)
+            way = (steps - 1 / steps) / 12 if follows else min(full, long)
         else:
             n = weight * self.r[new.step, j, c]
             white *= (2 - min(n * (1 - fade), 1)) / (1 + fade)

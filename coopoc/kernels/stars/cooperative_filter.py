@@ -15,7 +15,7 @@ from ..compiling.small import apply, inner_product, load, negate, store, subtrac
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
-from .cooperative_messages import fix_terms, follow_majority, goes_on, may_slip, receive, take_fix, trust, use_fix
+from .cooperative_messages import doubt_ego, fix_terms, goes_on, may_slip, receive, take_fix, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -369,7 +369,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
         goes_on(f, rows, who[i, ORDER])
     if model.fix_gate > 0.0:
         trust(f, model)
-        follow_majority(f, model)
+        doubt_ego(f, model)
     locate(f)
     ego[STEPS] += 1
     corrected(f)
@@ -421,7 +421,7 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
             fix_terms(f, 0)
             q = innovate(f.g, f.h)
     spoken = speak_for(f, model, own, rows, count, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
-    use_fix(f, model, 0, True, q, spoken >= -0.5 * FIX_GATE, may_slip(own, FIX_VARIANCE, way * way))
+    use_fix(f, model, 0, True, q, spoken >= 0.0, may_slip(own, FIX_VARIANCE, way * way))
     corrected(f)
 
 

@@ -81,9 +81,10 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
         if f.slot[vehicles[i]] >= 0:
             who[f.slot[vehicles[i]], INPUT] = i
     outvoted = model.fix_gate > 0.0 and is_outvoted(f, model, own, rows, count)
-    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and (outvoted or needs_restart(f))
-    if again:
-        start(f, model, own, rows, count)
+    if outvoted:
+        set_trust(f, who[0, VEHICLE], 1.0, model.own)
+    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX])
+    again = again and (outvoted or needs_restart(f, own)) and start(f, model, own, rows, count)
     for k in range(1, len(who)):
         j = who[k, VEHICLE]
         if j < 0 or (who[k, INPUT] >= 0 and not again and not contradicted(f, k)):

@@ -98,8 +98,8 @@ TRUST_LOG_ODDS, PENALTY, REVOKE_LOG_ODDS = 2.0, 4.0, 2.0
 """Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
 MOVES = 0.01
 """Share of the variance of a fix from which the square of a step's motion says that a vehicle does not stand."""
-LEAST, WINDOW = 10.0, 30.0
-"""Fixes in the mean innovation of a vehicle: from how many it counts, and the most."""
+WINDOW = 30.0
+"""Fixes in the mean innovation of a vehicle."""
 
 
 @inside
@@ -297,14 +297,13 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         member[k, EXTRA_VARIANCE] = 0.0
         return 1.0
     judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
-    gap = vector_at(h.three, GAP // 3)
-    far2 = inner_product(gap, gap)
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if not supported:  # neighbours see the ego where the fix is
-            widen(g, 0, far2 / 3.0)
+            gap = vector_at(h.three, GAP // 3)
+            widen(g, 0, inner_product(gap, gap) / 3.0)
         elif f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        set_trust(f, j, 0.0 if supported else 1.0, (max(TAU**2, far2) if supported else 0.0) + model.own)
+        set_trust(f, j, 0.0 if supported else 1.0, (TAU**2 if supported else 0.0) + model.own)
         if k == 0 and ego[JUMPED] == 0.0:
             ego[AGREED] = 0.0
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
@@ -313,7 +312,8 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
             innovate(g, h)
             correct(g, h, 1.0)
         return 0.0 if supported else 1.0
-    q = min(as_answered(f, q) if k == 0 else q, far2 / slip)
+    gap = vector_at(h.three, GAP // 3)
+    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / slip)
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
@@ -350,9 +350,9 @@ def as_answered(f: Filter, q: float) -> float:
 @inside
 def wrong(f: Filter, model: Model, k: int, q: float) -> bool:
     """Whether the receiver of member k errs: on average, or for so long that its fixes would be used again. The ego's
-    does so only beside a trusted neighbour: no other shows whether it or the position is wrong."""
-    locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE
-    return (k > 0 or heard(f, True) > 0) and (wrong_on_average(f, model, k, q) or locked)
+    counts as wrong in the second way only beside a trusted neighbour."""
+    locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True) > 0)
+    return wrong_on_average(f, model, k, q) or locked
 
 
 @inside
@@ -372,10 +372,9 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE)
     near, narrow = distance(s, mean)
-    if count < LEAST or near < 2.0 * (odds + REVOKE_LOG_ODDS):
+    if count < 3.0 or near < 2.0 * (odds + REVOKE_LOG_ODDS):
         return False
-    usual = usual_error(f, k) if k > 0 else 0.0  # the ego's receiver is compared with all others
-    tau2 = min(TAU**2, inner_product(mean, mean) / 3.0)  # the likeliest
+    usual, tau2 = usual_error(f, k) if k > 0 else 0.0, TAU**2  # the ego's receiver is compared with all others
     s = add_diagonal(s, (usual, usual, usual))
     near, narrow = distance(s, mean)
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
@@ -424,59 +423,52 @@ def trust(f: Filter, model: Model) -> None:
 
 
 @part
-def follow_majority(f: Filter, model: Model) -> None:
-    """Where more receivers err by one and the same vector beyond doubt than are trusted, the star is where they are
-    not: the ego goes there, they are trusted, and all join anew. The ego's own must be among them, or no neighbour
-    ever have been trusted and most of them agree: then it is the ego's that errs."""
-    who, status = f.who, f.status
+def doubt_ego(f: Filter, model: Model) -> None:
+    """Where the fixes of most neighbours err by one and the same vector beyond doubt, and none has ever been trusted,
+    it is the ego's receiver that errs: the ego goes where they see it, and they join anew."""
+    who, members = f.who, range(1, len(f.who))
     g, ego, best, most, others = f.g, who[0, VEHICLE], ABSENT, 1, heard(f, False)
-    own = status[ego, TRUSTED] == 0.0
+    if others < 2 or f.status[ego, TRUSTED] == 0.0:
+        return
     for j in range(len(f.slot)):
-        if not own and j != ego and (status[j, TRUSTED] > 0.0 or status[j, REVOKED] > 0.0):
+        if j != ego and (f.status[j, TRUSTED] > 0.0 or f.status[j, REVOKED] > 0.0):
             return
-    for k in range(1 if own else len(who)):
+    for k in members:
         alike = 0
-        for i in range(len(who)):
-            alike += errs(f, k) and errs(f, i) and (i == k or difference(f, k, i) < FIX_GATE)
+        for i in members:
+            alike += difference(f, k, k) > WILD and (i == k or difference(f, k, i) < FIX_GATE)
         if alike > most:
             best, most = k, alike
-    if best < 0 or (most <= heard(f, True) + 1 if own else 2 * most <= others):
+    if 2 * most <= others:
         return
     first, spread = 3 * g.block[best, ERROR], 0.0
     for c in range(3):
         spread += (g.p[c, c] + g.p[first + c, first + c] + 2.0 * g.p[c, first + c]) / 3.0
     there = add(vector_at(g.x, 0), vector_at(g.x, first // 3))
-    for k in range(len(who)):
-        who[k, HITS] = errs(f, k) and (k == best or difference(f, best, k) < FIX_GATE)
-    for k in range(len(who)):
+    for k in members:
+        who[k, HITS] = k == best or difference(f, best, k) < FIX_GATE
+    for k in members:
         j, agrees = who[k, VEHICLE], who[k, HITS] > 0
-        if j < 0:
-            continue
-        if k > 0:
+        if j >= 0:
             dismiss(f, model, k, False)
-        status[j, REVOKED] += 0.0 if agrees or status[j, TRUSTED] == 0.0 else 1.0
-        set_trust(f, j, 1.0 if agrees else 0.0, (0.0 if agrees else TAU**2) + model.own)
+            if agrees:
+                set_trust(f, j, 1.0, model.own)
     clear(g, 0)
     store(g.x, 0, there)
     widen(g, 0, spread)
+    set_trust(f, ego, 0.0, TAU**2 + model.own)
+    f.status[ego, REVOKED] += 1.0
     f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], who[0, REJECTED] = NOT_REMEMBERED_M2, 0.0, 0.0, 0
 
 
 @part
-def errs(f: Filter, k: int) -> bool:
-    """Whether a member's fixes, which are not trusted, err beyond doubt; while the ego's position is established, of a
-    neighbour that never was trusted: what all receivers do at once moves no ego."""
-    j = f.who[k, VEHICLE]
-    if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
-        return False
-    early = k == 0 or f.ego[AGREED] <= 0.0 or f.status[j, REVOKED] == 0.0
-    return early and difference(f, k, k) > WILD
-
-
-@part
 def difference(f: Filter, k: int, i: int) -> float:
-    """Squared normalised difference of the errors of two members' fixes, from 0 where they are the same."""
+    """Squared normalised difference of the errors of two members' fixes, infinite where one has sent none; of one error
+    from 0 where they are the same, 0 then."""
     g, h, two = f.g, f.h, 1.0 if i != k else 0.0
+    for m in (k, i):
+        if f.who[m, VEHICLE] < 0 or f.status[f.who[m, VEHICLE], USED] == -math.inf:
+            return math.inf if i != k else 0.0
     a, b = 3 * g.block[k, ERROR], 3 * g.block[i, ERROR]
     for c in range(3):
         for d in range(3):

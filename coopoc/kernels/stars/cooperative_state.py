@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
-from ..compiling.small import add, load, store
+from ..compiling.small import add, inner_product, load, store, subtract
 from ..gate import CONFIRMED, FIX_GATE, NOT_REMEMBERED_M2, PATIENCE, Vector, vote
 from .gaussian import (
     ABSENT,
@@ -242,22 +242,26 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
 
 
 @part
-def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> None:
+def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
     """The ego stands somewhere near its fix, which is trusted, or, without one, where most neighbours see it.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
-    fix is not used.
+    fix is not used. Of an ego that is not trusted all must agree with the fix: two that multipath displaced do so by
+    chance; else nothing is changed, and False returned.
     """
-    blind, best, own_votes, g, ego = math.isnan(own[FIX]), ABSENT, 0, f.g, f.who[0, VEHICLE]
+    blind, best, heard, own_votes, g, ego = math.isnan(own[FIX]), ABSENT, 0, 0, f.g, f.who[0, VEHICLE]
     most = 0 if blind else 1
     for i in range(-1, count if model.fix_gate > 0.0 or blind else -1):
         agree = 0
         for j in range(-1, count):
             agree += mahalanobis2(own, rows, i, j) <= model.fix_gate
+        heard += agree > 0
         if i < 0:
             own_votes = agree
         if agree > most:
             best, most = i, agree
+    if own_votes < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
+        return False
     f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, REJECTED], f.member[0, LOCKED] = (
         model.flat,
         f.ego[STEPS],
@@ -275,6 +279,7 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> Non
         for c in range(3):
             g.x[c], own[FIX + c] = seen_from(rows, best, c), math.nan
         widen(g, 0, model.flat)
+    return True
 
 
 @part
@@ -329,11 +334,26 @@ def heard(f: Filter, trusted: bool) -> int:
 
 
 @part
-def needs_restart(f: Filter) -> bool:
-    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and fixes have contradicted it for
-    so long that they would be used again, and turn its odometry towards them."""
-    contradicted = f.who[0, REJECTED] > 0 and f.member[0, LOCKED] >= PATIENCE
-    return bool(f.status[f.who[0, VEHICLE], TRUSTED] > 0.0 and contradicted and not heard(f, True))
+def needs_restart(f: Filter, own: Floats) -> bool:
+    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either fixes have contradicted
+    it for so long that they would be used again (and turn its odometry towards them), or its receiver is not trusted
+    beside others that are not. One other suffices where the error of the ego's fixes would be beyond all doubt, or is
+    the other's, too: it is the ego's."""
+    who = f.who
+    others, last = heard(f, False), 0
+    if heard(f, True):
+        return False
+    if f.status[who[0, VEHICLE], TRUSTED] > 0.0:
+        return bool(who[0, REJECTED] > 0 and f.member[0, LOCKED] >= PATIENCE)
+    if f.ego[AGREED] > 0.0:
+        return False
+    for k in range(1, len(who)):
+        last = k if who[k, VEHICLE] >= 0 and f.status[who[k, VEHICLE], USED] > -math.inf else last
+    error, noise = vector_at(f.g.x, f.g.block[0, ERROR]), sum(vector_at(own, FIX_VARIANCE // 3)) / 3.0
+    gap = subtract(error, vector_at(f.g.x, f.g.block[last, ERROR]))
+    far = inner_product(error, error)
+    agree = far > FIX_GATE * noise and inner_product(gap, gap) < FIX_GATE * noise
+    return others >= 2 or (others == 1 and bool(far > WILD * noise or agree))
 
 
 @part
