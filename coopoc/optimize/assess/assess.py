@@ -377,7 +377,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
         convex = not problem.movable.any() or (
             problem.linear and all(c.measurement.linear for c in problem.constraints)
         )
-        whys = [] if convex or not problem.movable.any() else ["a local minimum (try other x0, or certify it)"]
+        whys = [] if convex else ["a local minimum (try other x0, or certify it)"]
         if pushing:
             whys += [f"{pushing} bounds that push contradict the measurements"]
         elif equal := sorted({c.kind for c in problem.constraints if (c.lower == c.upper).any()}):
