@@ -33,8 +33,7 @@ def recording(runs: int = 4, whole: bool = True) -> Recording:
     fleet = drive()
     if whole:
         fleet = fleet.select([0, 1, 2])
-    channel = V2X(max_neighbours=3, loss=0.2, latency=0.1)
-    return observe(fleet, Sensors.paper_scenario2(), channel, runs=runs, seed=5)
+    return observe(fleet, Sensors.paper_scenario2(), V2X(max_neighbours=3, loss=0.2, latency=0.1), runs=runs, seed=5)
 
 
 def with_parts(valid: Recording, **parts: Any) -> Recording:

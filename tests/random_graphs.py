@@ -81,8 +81,7 @@ def star(kind: str, seed: int, neighbours: int = 6, fix_std: float = 2.0, height
     rng = np.random.default_rng(seed)
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (neighbours, 3)) * [1, 1, height]])
     names = ("ego", *(f"v{j}" for j in range(1, neighbours + 1)))
-    fixes = truth + rng.normal(0, fix_std, truth.shape)
-    problem = Problem(names).add("position", names, fixes, std=fix_std)
+    problem = Problem(names).add("position", names, truth + rng.normal(0, fix_std, truth.shape), std=fix_std)
     v, std = truth[1:], 0.5 if kind == "range" else 0.05
     z = np.linalg.norm(v, axis=1) if kind == "range" else np.arctan2(v[:, 1], v[:, 0])
     z = z + rng.normal(0, std, neighbours)

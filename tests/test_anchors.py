@@ -29,8 +29,9 @@ def fixture(fleet: Fleet, neighbours: int, ratio: float = 1.0, sensors: Sensors 
 def score(method, recording: Recording, fleet: Fleet) -> float:
     """Mean RT-LE over runs from step 1 on: the anchors start at a fix that is not scored."""
     track = method(recording, [0])
-    late = replace(track, t=track.t[1:], x=track.x[:, 1:], covariance=None)
-    return float(rt_le(late, fleet.between(1, len(fleet.t))).mean())
+    return float(
+        rt_le(replace(track, t=track.t[1:], x=track.x[:, 1:], covariance=None), fleet.between(1, len(fleet.t))).mean()
+    )
 
 
 def tuned(ratio: float = 1.0, gnss: float = 3.5) -> NoiseModel:
@@ -77,5 +78,6 @@ def test_scenario1_anchors(formation):
         (Kalman(tuned(1.5, gnss=1.8)), 1.42, 3.6, 0.15),
     ):
         assert score(method, recording, formation) == pytest.approx(mean, rel=0.05)
-        measured = max_error(method(recording, [0]), formation).mean()
-        assert measured == pytest.approx(largest, abs=0.05 * largest + 1.5 * spread)
+        assert max_error(method(recording, [0]), formation).mean() == pytest.approx(
+            largest, abs=0.05 * largest + 1.5 * spread
+        )

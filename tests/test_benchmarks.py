@@ -152,8 +152,7 @@ def test_parameters_are_chosen_on_other_drives_and_draws():
         assert (task.name, task.sensors, task.v2x) == (other.name, other.sensors, other.v2x)
         assert task.seed != other.seed
     used = {co.load_fleet(task.data).digest for task in TASKS}
-    chosen = {co.load_fleet(name).digest for name in ("town10-validation", "town10-clients")}
-    assert not used & chosen
+    assert not used & {co.load_fleet(name).digest for name in ("town10-validation", "town10-clients")}
     assert {task.data for task in VALIDATION} == {"town10-validation"}
 
 
@@ -164,8 +163,9 @@ def test_the_cards_method_is_scored_as_by_hand(short, tmp_path):
     row = {row["task"]: row for row in card["tasks"]}["paper"]
     task = replace(PAPER, runs=2, egos=2)
     fleet, egos = co.load_fleet("town10"), list(task.columns)
-    seen = co.observe(fleet, task.sensors, task.v2x, runs=2, seed=task.seed, observers=egos)
-    error = co.rt_le(co.JointFilter()(seen, egos), fleet)
+    error = co.rt_le(
+        co.JointFilter()(co.observe(fleet, task.sensors, task.v2x, runs=2, seed=task.seed, observers=egos), egos), fleet
+    )
     assert row["rt_le_m"][0] == pytest.approx(error.mean(), abs=1e-4)
     least = np.sqrt(np.mean([co.bound_rt_le(co.posterior_bound(fleet, task.sensors, e, task.v2x)) ** 2 for e in egos]))
     assert row["bound_m"] == pytest.approx(least, abs=1e-4)
@@ -181,8 +181,7 @@ def test_the_cards_method_is_scored_as_by_hand(short, tmp_path):
 
 def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short, tmp_path, capsys):
     (tmp_path / "mine.py").write_text(OWN)
-    name = f"{tmp_path / 'mine.py'}:Own"
-    assert benchmark.benchmark((name,), out=tmp_path) == 1
+    assert benchmark.benchmark((f"{tmp_path / 'mine.py'}:Own",), out=tmp_path) == 1
     assert re.search(r'mine\.py", line \d+, in __call__\n.*\n +ValueError: neighbours', capsys.readouterr().err)
     (file,) = tmp_path.glob("*.json")
     card = json.loads(file.read_text())
@@ -274,7 +273,8 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
     fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=TRUE_POSE_STD, assumed=noise)
     assert whole["rt_le_m"][0] == pytest.approx(by_hand(fleet), abs=2e-4)
     own = rows[f"{tmp_path / 'mine.py'}:Own"]
-    mine = co.PoseFilter("solo", begin=begin, assumed=noise)
-    assert own["uwb"]["rt_le_m"][0] == pytest.approx(by_hand(mine), abs=2e-4)
+    assert own["uwb"]["rt_le_m"][0] == pytest.approx(
+        by_hand(co.PoseFilter("solo", begin=begin, assumed=noise)), abs=2e-4
+    )
     assert own["robots"]["rt_le_m"][0] > rows["pose-solo"]["robots"]["rt_le_m"][0] / 2
     assert own["robots"]["data"] == rows["pose-solo"]["robots"]["data"]

@@ -32,8 +32,9 @@ def test_exact_sensors_give_the_true_motion_back(crossing):
     seen = co.observe(crossing, exact, frame="body")
     assert np.allclose(in_world(seen).velocity[0, 1:], crossing.velocity[1:], atol=1e-12)
     heading = true_heading(crossing)
-    leaps = replace(crossing, heading=np.angle(-np.exp(1j * (heading - heading[30]))))
-    wrapped = co.observe(leaps, exact, frame="body")
+    wrapped = co.observe(
+        replace(crossing, heading=np.angle(-np.exp(1j * (heading - heading[30])))), exact, frame="body"
+    )
     for body in (seen.body, wrapped.body):  # a heading that leaps by a turn was a yaw rate of 63 rad/s
         assert np.allclose(np.diff(heading, axis=0), crossing.dt * body.yaw_rate[0, 1:], atol=1e-12)
 
@@ -96,6 +97,7 @@ def test_who_has_no_heading_notes_tags(body):
 
 
 def test_a_cap_acts_in_body_frames(crossing):
-    capped = co.V2X(max_neighbours=3, bytes_per_second=500.0)
-    track = co.PoseFilter(fusion="naive")(co.observe(crossing, NOISE, capped, frame="body"))
+    track = co.PoseFilter(fusion="naive")(
+        co.observe(crossing, NOISE, co.V2X(max_neighbours=3, bytes_per_second=500.0), frame="body")
+    )
     assert track.received_bytes.max() <= 500.0 * 7.0

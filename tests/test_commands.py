@@ -70,8 +70,7 @@ def parsed(argv: list[str]) -> tuple[str, dict[str, Any]]:
     def arguments(*given, **options):
         return dict(bind(*given, **options).arguments)
 
-    made = tyro.cli(arguments, prog="coopoc", args=argv, config=(tyro.conf.FlagCreatePairsOff,))
-    return " ".join(names), made
+    return " ".join(names), tyro.cli(arguments, prog="coopoc", args=argv, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 @pytest.fixture(scope="module")

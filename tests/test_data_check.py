@@ -159,8 +159,7 @@ def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_has_a_line(tmp_path, fault):
     change, message = FAULTS[fault]
-    options = {"dt": 0.2} if "stamps" in fault else {}
-    text = said(read_log(cars(tmp_path / "log", change), **options))
+    text = said(read_log(cars(tmp_path / "log", change), **{"dt": 0.2} if "stamps" in fault else {}))
     assert pd.Series([text]).str.contains(message, regex=True)[0], text
     if "look" not in message:
         assert "look" not in text

@@ -213,8 +213,9 @@ def test_a_hundred_anchors_are_read_without_a_word(tmp_path):
     ranges = abs(x[:, None] - places[0] - 1j * places[1]) + rng.normal(0, 0.01, (len(t), 110)) + 0.05
     table = {"x": x.real, "y": x.imag} | {f"range_m{k}": each for k, each in enumerate(ranges.T)}
     pd.DataFrame({"t": t, "vehicle": "a", **table}).to_csv(tmp_path / "log.csv")
-    marks = pd.DataFrame({"vehicle": [f"m{k}" for k in range(110)], "x": places[0], "y": places[1]})
-    marks.to_csv(tmp_path / "places.csv")
+    pd.DataFrame({"vehicle": [f"m{k}" for k in range(110)], "x": places[0], "y": places[1]}).to_csv(
+        tmp_path / "places.csv"
+    )
     log = load_log(str(tmp_path))
     assert len(log.recording.relative[0]) == 110 * len(t)
     assert not check(log).places

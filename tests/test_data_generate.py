@@ -89,8 +89,9 @@ def test_smoothing_solves_the_penalised_least_squares():
     x = np.random.default_rng(0).normal(size=(40, 3))
     weight = (2 * pi * 0.5 * 0.1) ** -3
     stacked = np.vstack([np.eye(40), weight * np.diff(np.eye(40), n=3, axis=0)])
-    expected = np.linalg.lstsq(stacked, np.vstack([x, np.zeros((37, 3))]), rcond=None)[0]
-    np.testing.assert_allclose(smooth(x, 0.1, 0.5), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        smooth(x, 0.1, 0.5), np.linalg.lstsq(stacked, np.vstack([x, np.zeros((37, 3))]), rcond=None)[0], atol=1e-9
+    )
 
 
 @with_sumo

@@ -134,8 +134,9 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x.real, "y": x.imag, "speed": 3.0, "yaw_rate": 0.5})
     wide.loc[::50, "heading"] = np.angle(np.exp(1j * heading[::50]))
     azimuth = np.angle(20 + 5j - own)
-    body = np.degrees(np.angle(np.exp(1j * (azimuth - h))))
-    radio = pd.DataFrame({"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": body})
+    radio = pd.DataFrame(
+        {"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": np.degrees(np.angle(np.exp(1j * (azimuth - h))))}
+    )
     (tmp_path / "log").mkdir()
     write(wide, tmp_path / "log" / "car.csv")
     write(radio, tmp_path / "log" / "camera.csv")

@@ -232,8 +232,9 @@ def parts(folder: Path) -> Path:
     head, *rows = GOOD.splitlines()
     uwb = [row.replace("range", "uwb") for row in rows if ",range," in row]
     (folder / "radio.csv").write_text("\n".join([head.replace("partner", "peer"), *uwb]))
-    rest = [row for row in rows if ",range," not in row]
-    (folder / "car.csv").write_text("\n".join([head.replace("vehicle", "car"), *rest]))
+    (folder / "car.csv").write_text(
+        "\n".join([head.replace("vehicle", "car"), *[row for row in rows if ",range," not in row]])
+    )
     (folder / "truth.csv").write_text(WIDE.replace("speed,heading", "a,b"))
     return folder
 

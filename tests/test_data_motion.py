@@ -133,8 +133,7 @@ def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_
     assert "forward, y left, z up" in " ".join(read.recording.notes)
     world = in_world(read.recording) if frame == "body" else read.recording
     assert_allclose(world.velocity, ideal.recording.velocity, atol=0.03)
-    method = co.PoseFilter("solo") if frame == "body" else co.Kalman()
-    assert error(read, method) < 1.3 * error(ideal, co.Kalman())
+    assert error(read, co.PoseFilter("solo") if frame == "body" else co.Kalman()) < 1.3 * error(ideal, co.Kalman())
 
 
 def test_a_body_velocity_that_errs_for_long_misleads_no_pose_filter(tmp_path):

@@ -92,8 +92,9 @@ def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_sta
     """A plain extended Kalman filter of 25 numbers, written elsewhere: 0.32 m without and 0.25 m with a landmark."""
     begin = co.pose_start(seen, gate=5.0)
     for landmarks, most in ((0, 0.32), (1, 0.25)):
-        made = co.PoseFilter("fleet", lasting=True, gate=5.0, begin=begin)
-        track = made(thinned(seen, landmarks, 3000), log.fleet.ids)
+        track = co.PoseFilter("fleet", lasting=True, gate=5.0, begin=begin)(
+            thinned(seen, landmarks, 3000), log.fleet.ids
+        )
         squares = np.square(track.x[0, 3000:7500] - log.fleet.position[3000:7500]).sum(-1)
         assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), 1)).mean() < most
 
@@ -150,8 +151,7 @@ def test_the_study_runs_on_any_set(which, other_set, tmp_path):
     assert nees["trained-centralised", most, 15] < 7.0
     assert nees["pose-naive", most, 0] > 10.0
     folder = tmp_path / "real"
-    tables = {file.stem for file in (folder / "tables").glob("*.md")}
-    assert tables == {"rt_le", "heading", "nees", "difference"}
+    assert {file.stem for file in (folder / "tables").glob("*.md")} == {"rt_le", "heading", "nees", "difference"}
     assert (folder / "figures" / "training.png").stat().st_size > 10_000
 
 

@@ -125,8 +125,9 @@ def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d():
     assert log.origin is not None
     at = np.array([(m.lat, m.lon, float(m.alt) + float(m.sep)) for m in parsed])
     assert_allclose(at[0], log.origin)
-    wanted = np.column_stack(pymap3d.geodetic2enu(*at.T, *log.origin))
-    assert_allclose(log.recording.gnss[0, :100, 0], wanted, atol=1e-5)
+    assert_allclose(
+        log.recording.gnss[0, :100, 0], np.column_stack(pymap3d.geodetic2enu(*at.T, *log.origin)), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("ros", [1, 2])
@@ -207,8 +208,9 @@ def test_motion_capture_and_radios_of_a_public_bag():
             errors.append(ranges - norm(gap, axis=0))
     links = recording.links
     ends = recording.gnss[0, links.step, links.observer] - recording.gnss[0, links.step, links.neighbour]
-    mine = recording.relative[0, :, 0] - norm(ends, axis=1)
-    assert np.nanmedian(mine) == pytest.approx(np.median(np.concatenate(errors)), abs=0.01)
+    assert np.nanmedian(recording.relative[0, :, 0] - norm(ends, axis=1)) == pytest.approx(
+        np.median(np.concatenate(errors)), abs=0.01
+    )
     assert np.isfinite(recording.relative[0, :, 0]).sum() > 0.95 * sum(map(len, errors))
 
 

@@ -73,8 +73,9 @@ def test_bound_of_a_single_vehicle_is_the_riccati_equations():
     found = posterior_bound(fleet, OWN, 0)[-1, 0, 0]
     process = np.diag([(0.1 * OWN.velocity_std_ratio * 10.0) ** 2, 4 * (1 - keep**2)])
     prior = solve_discrete_are(np.diag([1.0, keep]).T, np.ones((2, 1)), process, np.array([[1.5**2]]))
-    gain = prior.sum(1) / (prior.sum() + 1.5**2)
-    assert found == pytest.approx((prior - np.outer(gain, prior.sum(0)))[0, 0], rel=1e-3)
+    assert found == pytest.approx(
+        (prior - np.outer(prior.sum(1) / (prior.sum() + 1.5**2), prior.sum(0)))[0, 0], rel=1e-3
+    )
 
 
 def test_rms_and_nees_agree_with_the_bound():

@@ -56,8 +56,9 @@ def test_a_judge_of_ones_is_the_textbook_filter(drawn):
 
 
 def test_a_judge_learns_its_targets():
-    packs = [star.pack(drawn.recording, drawn.egos[0], drawn.fleet) for drawn in WITH_AND_WITHOUT]
-    rows = judge.rows_of(packs, star.Judge(star.NONE), 0)
+    rows = judge.rows_of(
+        [star.pack(drawn.recording, drawn.egos[0], drawn.fleet) for drawn in WITH_AND_WITHOUT], star.Judge(star.NONE), 0
+    )
     assert sum(map(len, rows)) > 100
     assert all(np.isfinite(each).all() for each in rows)
     before = judge.begin(0)

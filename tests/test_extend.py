@@ -68,8 +68,9 @@ def test_a_method_of_ones_own_beside_others(folder):
     rows, fleet = Results.load(folder / "runs/side_by_side").select(method="alpha.py:Alpha"), load_fleet("town10")
     for _, row in rows.iterrows():
         name = f"{row['max_neighbours']}-alpha.py_Alpha-nominal-{row['ego']}-run{row['run']}.tum"
-        path = np.loadtxt(folder / "runs/side_by_side/tracks" / name)[:, 1:4]
-        error = path - fleet.position[:, fleet.index(row["ego"])]
+        error = (
+            np.loadtxt(folder / "runs/side_by_side/tracks" / name)[:, 1:4] - fleet.position[:, fleet.index(row["ego"])]
+        )
         assert np.sqrt(np.mean(np.sum(error**2, 1))) == pytest.approx(row["rt_le_m"], rel=1e-6)
     alpha, *_, bound = re.findall(r"^\| (\S.*?) +\|(?: [a-z]+ +\|)? +\**([\d.]+)\**", table, flags=re.MULTILINE)[:4]
     assert (alpha[0], bound[0]) == ("alpha", "Cramér-Rao bound")

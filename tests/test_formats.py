@@ -158,8 +158,9 @@ def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str
     edges = graph.relative_pose
     found = [factors.at(k) for k in range(factors.size()) if "Between" in type(factors.at(k)).__name__]
     assert [f.keys() for f in found] == [[keys[graph.names[n]] for n in nodes] for nodes in edges.nodes]
-    measured = np.array([f.measured().matrix() for f in found])
-    assert_allclose(measured, _matrices(edges.position, edges.rotation), atol=atol)
+    assert_allclose(
+        np.array([f.measured().matrix() for f in found]), _matrices(edges.position, edges.rotation), atol=atol
+    )
     cov = np.array([f.noiseModel().covariance() for f in found])
     scale = abs(edges.covariance).max(axis=(1, 2), keepdims=True)
     assert_allclose(cov / scale, edges.covariance[:, order][:, :, order] / scale, atol=max(atol, 1e-10))
@@ -197,8 +198,7 @@ def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it():
     _assert_gtsam_agrees(graph, factors, values, {f"A{k}": k for k in range(20)}, atol=1e-5)  # six-digit quaternions
     seen = [factors.at(k) for k in range(factors.size()) if "BearingRange" in type(factors.at(k)).__name__]
     assert len(seen) == len(graph.relative_point) == 80
-    distance = [f.measured().range() for f in seen]
-    assert_allclose(norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
+    assert_allclose(norm(graph.relative_point.position, axis=1), [f.measured().range() for f in seen], atol=1e-12)
 
 
 def test_a_graph_cannot_be_changed_and_lists_its_robots():

@@ -179,8 +179,9 @@ def test_a_covariance_with_a_small_negative_eigenvalue_is_refused(tmp_path, shar
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     covariance = turn @ np.diag([1.0, 0.5, share]) @ turn.T
     upper = " ".join(map(repr, covariance[np.triu_indices(3)].tolist()))
-    text = f"VERTEX_SE2 0.0 A0 0 0 0\nVERTEX_SE2 1.0 A1 1 0 0\nEDGE_SE2 1.0 A0 A1 1 0 0 {upper}\n"
-    (tmp_path / "a.pyfg").write_text(text)
+    (tmp_path / "a.pyfg").write_text(
+        f"VERTEX_SE2 0.0 A0 0 0 0\nVERTEX_SE2 1.0 A1 1 0 0\nEDGE_SE2 1.0 A0 A1 1 0 0 {upper}\n"
+    )
     if share > 0:
         np.testing.assert_allclose(load_graph(tmp_path / "a.pyfg").relative_pose.covariance[0], covariance, atol=1e-15)
     else:

@@ -29,8 +29,9 @@ def test_weights_are_those_of_the_surrogate(mu):
     """w = d rho_mu / d r^2, and the minimiser of w r^2 + Phi_mu(w), whose minimum is rho_mu (Black and Rangarajan)."""
     for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
         weight = float(graduated.weights(np.array(r**2), mu))
-        gradient_ = (paper_rho(np.sqrt(r**2 + 1e-7), mu) - paper_rho(np.sqrt(r**2 - 1e-7), mu)) / 2e-7
-        assert weight == pytest.approx(gradient_, abs=1e-6)
+        assert weight == pytest.approx(
+            (paper_rho(np.sqrt(r**2 + 1e-7), mu) - paper_rho(np.sqrt(r**2 - 1e-7), mu)) / 2e-7, abs=1e-6
+        )
         dual = minimize_scalar(
             lambda w, r=r: w * r**2 + mu * (1 - w) / (mu + w), bounds=(0, 1), options={"xatol": 1e-12}
         )
@@ -133,8 +134,7 @@ def test_gnc_that_rejects_every_measurement_is_reported():
 
 
 def test_a_limit_of_rounds_is_a_status(monkeypatch):
-    z = np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0])
-    problem = Problem([*"a"]).add("position", ["a"] * 12, z, std=1.0)
+    problem = Problem([*"a"]).add("position", ["a"] * 12, np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0]), std=1.0)
     monkeypatch.setattr(graduated, "MAX_ROUNDS", 2)
     with pytest.raises(SolveError) as caught:
         solve_gnc(problem, [0])

@@ -57,8 +57,9 @@ def test_no_net_invents_a_height():
     net, recording = GainNet(4, 1), seen()
     gnss: Floats = recording.gnss.copy()
     gnss[..., 2], gnss[:, 50:60] = 7.0, np.nan
-    flat = replace(recording, gnss=gnss, velocity=recording.velocity * [1.0, 1.0, 0.0])
-    assert (LearnedGain(net)(flat).x[..., 2] == 7.0).all()
+    assert (
+        LearnedGain(net)(replace(recording, gnss=gnss, velocity=recording.velocity * [1.0, 1.0, 0.0])).x[..., 2] == 7.0
+    ).all()
     assert np.ptp(LearnedGain(net)(recording).x[..., 2]) > 0.1
 
 

@@ -126,7 +126,8 @@ main(["check"])
     assert done.returncode == 1
     assert "(1, 3, 1, 3)" in done.stdout
     refused = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("refused")]
-    needs = {"pyarrow": ["fleet"], "pandas": ["fleet"], "casadi": ["casadi", "osqp", "gtsam"]}
-    assert refused == needs.get(library, [library])
+    assert refused == {"pyarrow": ["fleet"], "pandas": ["fleet"], "casadi": ["casadi", "osqp", "gtsam"]}.get(
+        library, [library]
+    )
     assert re.search(f"coopoc: {library}(-base)? is not installed. Run: pip install {library}", done.stderr)
     assert done.stdout.count("SOLVED") == {"casadi": 0, "pyarrow": 5, "pandas": 5}.get(library, 4)

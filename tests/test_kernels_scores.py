@@ -20,8 +20,7 @@ def track(crossing):
 def test_errors_and_nees_are_numpys(track, crossing):
     gap = track.x - crossing.position[:, [0, 5]]
     assert_allclose(errors(track, crossing), norm(gap, axis=-1), rtol=1e-14)
-    solved = solve(track.covariance, gap[..., None])[..., 0]
-    assert_allclose(nees(track, crossing), np.vecdot(gap, solved), rtol=1e-9)
+    assert_allclose(nees(track, crossing), np.vecdot(gap, solve(track.covariance, gap[..., None])[..., 0]), rtol=1e-9)
 
 
 def test_runs_are_scored_by_fours(crossing, monkeypatch):

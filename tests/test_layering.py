@@ -91,5 +91,6 @@ def test_no_file_imports_in_a_circle(package):
 def test_import_is_light():
     """`import coopoc` and the core nouns load none of the heavy libraries."""
     heavy = {"numba", "torch", "cvxpy", "gtsam", "casadi", "osqp", "pandas", "matplotlib", "sklearn"}
-    code = "import sys, coopoc; coopoc.Fleet, coopoc.observe; print(*sys.modules)"
-    assert not heavy & set(python("-c", code).split())
+    assert not heavy & set(
+        python("-c", "import sys, coopoc; coopoc.Fleet, coopoc.observe; print(*sys.modules)").split()
+    )

@@ -74,8 +74,7 @@ def test_the_file_is_checked_before_it_is_kept(tmp_path, monkeypatch):
 
 
 def test_the_card_travels_along(file, shipped):
-    props = {p.key: p.value for p in onnx.load(file).metadata_props}
-    assert json.loads(props["card"]) == dict(shipped.card)
+    assert json.loads({p.key: p.value for p in onnx.load(file).metadata_props}["card"]) == dict(shipped.card)
 
 
 def test_the_file_names_its_arrays_and_no_machine(file):
@@ -110,8 +109,9 @@ def test_the_documented_program_needs_onnxruntime_and_numpy_only(file, tmp_path)
     text = (ROOT / "docs" / "streaming.md").read_text()
     (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL) if "onnxruntime" in b]
     (tmp_path / "fedkalmannet.onnx").write_bytes(file.read_bytes())
-    ban = "import sys\nfor name in ('torch', 'coopoc', 'onnx'):\n    sys.modules[name] = None\n"
-    (tmp_path / "run.py").write_text(ban + block)
+    (tmp_path / "run.py").write_text(
+        "import sys\nfor name in ('torch', 'coopoc', 'onnx'):\n    sys.modules[name] = None\n" + block
+    )
     out = python("-W", "error", "run.py", cwd=tmp_path)
     x = np.array([float(word) for word in re.findall(r"-?\d+\.\d+", out)])
     assert x.shape == (3,)

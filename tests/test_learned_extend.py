@@ -37,8 +37,9 @@ def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder):
     trained, ran = (line for line in commands("constant_gain.py"))
     assert "constant_gain.RECIPE-gnss-axis-0.safetensors  3 parameters" in shell(trained, folder)
     table = shell(ran, folder)
-    rows = dict(re.findall(r"^\| (\S.*?) +\| +\**([\d.]+)\** \[", table, flags=re.MULTILINE))
-    assert float(rows["RECIPE"]) < 2.0, table
+    assert float(dict(re.findall(r"^\| (\S.*?) +\| +\**([\d.]+)\** \[", table, flags=re.MULTILINE))["RECIPE"]) < 2.0, (
+        table
+    )
 
 
 def test_a_checkpoint_of_a_file_runs_no_file_by_itself(folder):

@@ -74,8 +74,9 @@ def four():
 
 def trained(group: Sequence[Client], rounds: int = 3, model: Gain | None = None, **options: Any) -> Federation:
     """A short federation of constant gains."""
-    start = model or Steady()
-    return federate(start, group, rounds, **{"local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options})
+    return federate(
+        model or Steady(), group, rounds, **{"local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options}
+    )
 
 
 @pytest.mark.parametrize(

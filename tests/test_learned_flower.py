@@ -218,8 +218,9 @@ def test_no_node_answers_in_place_of_another():
 
 def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most():
     job, fleet = job_of(TINY), drives(3)
-    theta = in_process(job, fleet).history[0].weights
-    rows, found = deployed(job, vehicles(job, fleet, 3) | {3: sends("d", theta, num_examples=2**30)})
+    rows, found = deployed(
+        job, vehicles(job, fleet, 3) | {3: sends("d", in_process(job, fleet).history[0].weights, num_examples=2**30)}
+    )
     pieces = rows[1].pieces
     assert pieces["d"] == 10 * int(np.median([pieces["a"], pieces["b"], pieces["c"], 2**30]))
     assert found.history[1].note == f"d claims {2**30} pieces and counts with {pieces['d']}"
@@ -267,8 +268,7 @@ def test_the_text_of_an_error_stays_in_the_client(tmp_path, capsys):
     lines[7] = lines[7].rpartition(",")[0] + ",8361947.125x"
     (tmp_path / "drive.csv").write_text("\n".join(lines))
     message = Message(RecordDict({"config": ConfigRecord({"server-round": 1})}), 1, "train")
-    context = Context(1, 1, {"data": str(tmp_path / "drive.csv")}, RecordDict(), TINY)
-    reply = client_app()(message, context)
+    reply = client_app()(message, Context(1, 1, {"data": str(tmp_path / "drive.csv")}, RecordDict(), TINY))
     assert "8361947" in capsys.readouterr().err
     assert "8361947" not in str(reply.error)
     assert "in the client, see its own log" in str(reply.error.reason)

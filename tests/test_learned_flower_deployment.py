@@ -92,8 +92,7 @@ def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
         own = [c for c in job_clients(job, fleet) if c.name not in row["absent"].keys() | row["rejected"].keys()]
         trained = adapt(untrained(job), before, own, job.setting.seed, row["round"], plan.rounds, plan.local)
         fitted = [made.weights.numpy() for made in trained.values()]
-        sizes = [len(client.training) for client in own]
-        mean = np.average(np.stack(fitted).astype(float), axis=0, weights=sizes)
+        mean = np.average(np.stack(fitted).astype(float), axis=0, weights=[len(client.training) for client in own])
         assert theta.numpy() == pytest.approx(mean, abs=1e-6)
     return found.card
 
@@ -108,11 +107,13 @@ def test_the_script_survives_the_death_of_a_node(tmp_path, mark):
     """Four vehicles, TLS, keys, three rounds; the second vehicle is killed in the second."""
     fleet = winding(100, 4.0, 4.0, 4)
     write_table(fleet, tmp_path / "four.parquet")
-    command = script(tmp_path / "site", "--data", tmp_path / "four.parquet", "--kill", 2, "--change", CHANGE)
-    done = ran(command, timeout=600)
+    done = ran(
+        script(tmp_path / "site", "--data", tmp_path / "four.parquet", "--kill", 2, "--change", CHANGE), timeout=600
+    )
     assert done.returncode == 0, done.stderr
-    job = job_of({"recipe": "fedkalmannet", "rounds": 3, **TINY})
-    card = checked(tmp_path / "site" / "fedkalmannet.safetensors", job, fleet)
+    card = checked(
+        tmp_path / "site" / "fedkalmannet.safetensors", job_of({"recipe": "fedkalmannet", "rounds": 3, **TINY}), fleet
+    )
     assert card["clients"] == ["a", "b", "c", "d"]
     assert [("b" in row["absent"]) for row in card["history"][2:]] == [True, True]
     assert "killed node-2" in done.stdout

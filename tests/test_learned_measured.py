@@ -185,8 +185,9 @@ def test_a_log_trains_and_its_rest_scores(log, tmp_path, capsys):
 @pytest.mark.parametrize("name", RECIPES)
 def test_every_recipe_trains_on_a_log_and_follows_the_rest(name, log, tmp_path, monkeypatch):
     """A few steps, with fixes at every fifth step, in one plane: losses and estimates stay finite, and weights move."""
-    quick = replace(RECIPES[name], schedule=Schedule(epochs=4, batch=2, checks=2), rounds=2, local_epochs=1)
-    monkeypatch.setitem(RECIPES, name, quick)
+    monkeypatch.setitem(
+        RECIPES, name, replace(RECIPES[name], schedule=Schedule(epochs=4, batch=2, checks=2), rounds=2, local_epochs=1)
+    )
     whole = co.read_log(log)
     first, rest = whole.part(until=65), whole.part(since=65)
     made = train_all(first, tmp_path, recipes=[name], seeds=[0])

@@ -61,8 +61,9 @@ class Published(nn.Module):
             sigma = self.run("prior", torch.cat((h_q, fc6), 1), h_sigma)
             h_s = self.run("innovation", torch.cat((torch.relu(n.prior_to_innovation(sigma)), fc7), 1), h_s)
             k = n.gain(torch.relu(n.gain_hidden(torch.cat((sigma, h_s), 1))))
-            fc3 = torch.relu(n.posterior_hidden(torch.cat((h_s, k), 1)))
-            h_sigma = torch.relu(n.posterior(torch.cat((sigma, fc3), 1)))
+            h_sigma = torch.relu(
+                n.posterior(torch.cat((sigma, torch.relu(n.posterior_hidden(torch.cat((h_s, k), 1)))), 1))
+            )
             correction = torch.einsum("bij,bj->bi", k.reshape(-1, 3, 3), y - m_prior)
             m_old, m_prior_old, y_old, m = m, m_prior, y, m_prior + correction
             out.append(m)
@@ -118,8 +119,9 @@ def test_translating_the_world_translates_the_estimate():
 def test_a_given_start_is_used_and_its_shape_checked():
     fleet = winding()
     rec = observe(fleet, Sensors(), runs=2)
-    track = LearnedGain(GainNet(), x0=fleet.position[0])(rec)
-    assert_array_equal(track.x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3)))
+    assert_array_equal(
+        LearnedGain(GainNet(), x0=fleet.position[0])(rec).x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3))
+    )
     with refused("x0"):
         LearnedGain(GainNet(), x0=np.zeros((5, 3)))(rec)
 

@@ -19,8 +19,9 @@ QUICK = Schedule(epochs=6, batch=2, checks=3)
 
 def drives(lengths: tuple[int, ...] = (130, 260)) -> Fleet:
     """Drives of these lengths, absent afterwards."""
-    fleet = winding(max(lengths), 9.0, 4.0, len(lengths))
-    return without(fleet, *((slice(length, None), k) for k, length in enumerate(lengths)))
+    return without(
+        winding(max(lengths), 9.0, 4.0, len(lengths)), *((slice(length, None), k) for k, length in enumerate(lengths))
+    )
 
 
 def test_pieces_as_in_the_paper():

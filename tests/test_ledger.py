@@ -37,8 +37,9 @@ def test_the_papers_training_costs_as_much_as_an_hour_of_driving():
     assert once.per_vehicle(way="broadcast") == 1.5 * weights
     for rate, minutes in ((900.0, 59.1), (3500.0, 15.2)):
         moved = np.full((2, 1, 1), 2 * rate)
-        drive = Ledger(("a",), np.full(1, 2.0), moved, moved)
-        assert once.per_vehicle() / drive.rate() / 60 == pytest.approx(minutes, abs=0.05)
+        assert once.per_vehicle() / Ledger(("a",), np.full(1, 2.0), moved, moved).rate() / 60 == pytest.approx(
+            minutes, abs=0.05
+        )
     with refused("seconds"):
         once.rate()
 

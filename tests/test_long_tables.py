@@ -48,8 +48,7 @@ def test_a_track_as_a_table():
 def test_a_table_gives_the_score():
     """Independent check: RT-LE by pandas alone, from the tables of a track and of its fleet."""
     fleet = co.load_fleet("town10").between(0, 60)
-    seen = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(), runs=3)
-    made = co.Kalman()(seen, egos=[24, 7])
+    made = co.Kalman()(co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(), runs=3), egos=[24, 7])
     both = made.to_frame().merge(fleet.to_frame(), left_on=["step", "ego"], right_on=["step", "vehicle"])
     gap = sum((both[f"{axis}_x"] - both[f"{axis}_y"]) ** 2 for axis in "xyz")
     score = np.sqrt(gap.groupby([both["run"], both["ego"]]).mean()).unstack()[[fleet.ids[24], fleet.ids[7]]]

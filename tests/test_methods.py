@@ -55,8 +55,7 @@ def test_without_messages_it_is_the_solo_method(name, noise, channel, crossing):
     recording = observe(crossing.between(0, 40), S2, channel, runs=3)
     track = method(recording, [0, 1])
     gates = name != "cooperative-filter" and getattr(method, "robust", False)  # whose gate of a fix is another one
-    solo = Kalman(noise, robust=gates)
-    alone = (GNSS() if name in SNAPSHOTS else solo)(recording, [0, 1])
+    alone = (GNSS() if name in SNAPSHOTS else Kalman(noise, robust=gates))(recording, [0, 1])
     now = slice(-1, None) if name == "batch-smoother" else slice(None)
     assert track.x[:, now] == pytest.approx(alone.x[:, now], abs=1e-6 if name in SNAPSHOTS else 5e-4)
     if name not in SNAPSHOTS:

@@ -44,8 +44,7 @@ def test_no_method_falls_behind(name):
 
     models = NoiseModel.nominal(NOISY), NoiseModel.oracle(NOISY, fleet)
     found = np.subtract(*(ahead(METHODS[name](known)) for known in models))
-    most = SMOOTHED if name == "batch-smoother" else MOST
-    assert abs(found.mean()) < max(3 * found.std() / np.sqrt(RUNS), most)
+    assert abs(found.mean()) < max(3 * found.std() / np.sqrt(RUNS), SMOOTHED if name == "batch-smoother" else MOST)
 
 
 @pytest.mark.parametrize("reading", ["axis", "speed"])

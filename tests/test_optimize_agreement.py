@@ -32,8 +32,9 @@ def spherical() -> Problem:
 
 def drive(dimension: int, objective: Any) -> Problem:
     """Two robots of six poses each from the truth: odometry, loops, and ranges between them, the first pose held."""
-    graph = random_graph(3, dimension, steps=6, landmarks=0, loops=4, ranges=8, seen=0, step_std=0.1)
-    return from_graph(graph, objective, "file")
+    return from_graph(
+        random_graph(3, dimension, steps=6, landmarks=0, loops=4, ranges=8, seen=0, step_std=0.1), objective, "file"
+    )
 
 
 def linear() -> Problem:
@@ -42,8 +43,9 @@ def linear() -> Problem:
     names = [f"v{k}" for k in range(8)]
     root = rng.normal(size=(7, 3, 3))
     problem = Problem(names).add("position", names, 5.0 * rng.normal(size=(8, 3)), std=[3.0, 3.0, 5.0])
-    cov = root @ root.mT + 0.1 * np.eye(3)
-    return problem.add("displacement", list(itertools.pairwise(names)), rng.normal(size=(7, 3)), cov=cov)
+    return problem.add(
+        "displacement", list(itertools.pairwise(names)), rng.normal(size=(7, 3)), cov=root @ root.mT + 0.1 * np.eye(3)
+    )
 
 
 def bounded() -> Problem:
@@ -127,8 +129,9 @@ ONE_PLACE = Problem([*"ab"], x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0]
 def test_every_backend_agrees_on_robust_losses(backend, name, loss):
     """From the least-squares solution, so that all descend into one minimum."""
     plain = case(name)
-    robust = replace(plain.factors[-1], loss=Loss(loss, 1.5))
-    problem = replace(plain, factors=(*plain.factors[:-1], robust), x0=reference(name).x)
+    problem = replace(
+        plain, factors=(*plain.factors[:-1], replace(plain.factors[-1], loss=Loss(loss, 1.5))), x0=reference(name).x
+    )
     if require_backend(EVERY[backend]).capabilities.lacking(problem):
         with refused(f"cannot be solved by {backend}"):
             solve(problem, EVERY[backend])

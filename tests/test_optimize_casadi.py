@@ -24,8 +24,9 @@ def test_ranges_end_where_scipy_ends(start):
         found = solve(problem, "casadi")
         assert found.status is Status.SOLVED
         if start is None:
-            theirs = scipys(problem, initial_guess(problem), xtol=1e-15, ftol=1e-15)
-            assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
+            assert found.cost == pytest.approx(
+                scipys(problem, initial_guess(problem), xtol=1e-15, ftol=1e-15).cost, rel=1e-9
+            )
 
 
 @pytest.mark.parametrize(

@@ -193,8 +193,9 @@ def test_surface_lane_and_top_speed_are_scipys(seed):
     solution = solved(problem)
     assert solution.cost == pytest.approx(cost, rel=1e-8)
     assert solution.x == pytest.approx(x, abs=1e-4)
-    gone = solution.x[2:] - solution.x[:-2]
-    assert norm(gone, axis=1).max() == pytest.approx(7.0, abs=1e-6)  # the limit is met, not passed
+    assert norm(solution.x[2:] - solution.x[:-2], axis=1).max() == pytest.approx(
+        7.0, abs=1e-6
+    )  # the limit is met, not passed
     assert solution.x[:, 2] == pytest.approx(road(solution.x[:, 0], solution.x[:, 1]), abs=1e-9)
     assert abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
 

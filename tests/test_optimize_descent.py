@@ -25,8 +25,9 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes():
 def test_a_slope_that_bends_away_is_followed():
     """From the far side of a ring, where J^T J is a thousand times the curvature, which is negative: FAILED before."""
     problem = Problem([*"ar"], dimension=2, x0=[[0, 0], [10, 0.1]], fixed=(0,)).add("range", (0, 1), 10.0, std=0.1)
-    found = solve(problem.add("position", "r", [-0.01, 0.0], std=1.0))
-    assert found.x[1] == pytest.approx([-1000.01 / 101, 0.0], abs=1e-6)
+    assert solve(problem.add("position", "r", [-0.01, 0.0], std=1.0)).x[1] == pytest.approx(
+        [-1000.01 / 101, 0.0], abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))

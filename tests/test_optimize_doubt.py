@@ -65,8 +65,9 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
     with refused(r"line 5 = information.*positive definite.*--repair"):
         load_graph(file)
     own, axes = eigh([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
-    nearest = axes * np.maximum(own, 0.0) @ axes.T
-    assert inv(load_graph(file, repair=True).relative_pose.covariance[1]) == pytest.approx(nearest, abs=1e-4)
+    assert inv(load_graph(file, repair=True).relative_pose.covariance[1]) == pytest.approx(
+        axes * np.maximum(own, 0.0) @ axes.T, abs=1e-4
+    )
     with pytest.raises(SystemExit):
         main(["solve", str(file), "--repair"])
     out, err = capsys.readouterr()
@@ -80,8 +81,9 @@ def test_a_race_ends_as_low_as_the_best_of_all_starts(seed):
     graph = random_drive(seed, steps=40, loops=4, turn_std=0.6)
     costs = [solve(from_graph(graph, start=start), throw=False).cost for start in ("odometry", "file", "tree")]
     assert max(costs) > 1.01 * min(costs)
-    lost = replace(graph, position=np.full_like(graph.position, np.nan))
-    assert solve(from_graph(lost)).cost <= min(costs) * (1 + 1e-9)
+    assert solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan)))).cost <= min(costs) * (
+        1 + 1e-9
+    )
     truth = solve(from_graph(graph, start="file"))
     assert any("may be the truth" in note for note in truth.notes)
 
@@ -95,8 +97,9 @@ def test_covariances_of_many_nodes_are_computed_where_asked():
     assert np.isfinite(full.covariance).all()
     assert plain.cost == full.cost
     assert plain.seconds >= plain.solve_seconds + plain.check_seconds > plain.solve_seconds
-    free = replace(problem, names=(*problem.names, "L0"), x0=np.vstack([problem.x0, problem.x0[:1]]))
-    found = solve(free, throw=False)
+    found = solve(
+        replace(problem, names=(*problem.names, "L0"), x0=np.vstack([problem.x0, problem.x0[:1]])), throw=False
+    )
     assert (found.status, found.unobservable) == (Status.RANK_DEFICIENT, ("L0",))
 
 

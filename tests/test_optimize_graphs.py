@@ -90,8 +90,9 @@ def test_real_graphs_reach_the_best_that_is_known(name, best):
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
 def test_tapes_are_the_formulas(dimension, objective, loss):
     """Cost, gradient, J^T J and the exact Hessian of the tapes against r and J of a problem and differences of them."""
-    graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
-    problem = from_graph(graph, objective, start="file")
+    problem = from_graph(
+        random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40), objective, start="file"
+    )
     rho = None if loss is None else Loss(loss, 2.0)
     problem = replace(problem, factors=tuple(replace(f, loss=rho) for f in problem.factors))
     system, x = sparse(problem), problem.x0
@@ -153,8 +154,9 @@ def test_marginals_are_those_of_gtsams_bayes_tree(dimension):
 def test_marginals_of_a_chain_in_the_plane_are_those_of_its_noise(objective, tmp_path):
     """Closed form: four steps of 1 m, 0.1 m and 0.2 rad each; beside a constraint that does not hold, too."""
     vertices = [f"VERTEX_SE2 {k} 0 0 0" for k in range(5)]
-    steps = [f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 25" for k in range(4)]
-    (path := tmp_path / "chain.g2o").write_text("\n".join(vertices + steps))
+    (path := tmp_path / "chain.g2o").write_text(
+        "\n".join(vertices + [f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 25" for k in range(4)])
+    )
     problem = read_graph(path, objective)
     x = solve(problem).x
     for each in (problem, problem.constrain("range", (0, 4), upper=9.0)):
@@ -258,8 +260,9 @@ def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():
     assert from_graph(graph).fixed == (0, 40, 80)
     assert found.status is Status.SOLVED
     assert "no measurement joins all parts: A0, B0, C0 are fixed" in str(found.notes)
-    prior = PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)])
-    assert from_graph(replace(graph, pose_prior=prior)).fixed == (0, 80)
+    assert from_graph(
+        replace(graph, pose_prior=PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)]))
+    ).fixed == (0, 80)
 
 
 @pytest.mark.parametrize("start", ["auto", "odometry", "tree", "incremental"])

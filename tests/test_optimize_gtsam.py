@@ -16,8 +16,7 @@ LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 def nodes_of(dimension: int) -> Problem:
     """Three poses and two points somewhere."""
     rng = default_rng(1)
-    turn = rng.normal(size=(5, 3)) if dimension == 3 else rng.uniform(-3, 3, 5)
-    x = pose(10 * rng.normal(size=(5, dimension)), turn)
+    x = pose(10 * rng.normal(size=(5, dimension)), rng.normal(size=(5, 3)) if dimension == 3 else rng.uniform(-3, 3, 5))
     x[3:, dimension:] = np.eye(dimension).ravel()
     return Problem(tuple("abcde"), dimension=dimension, poses=range(3), x0=x)
 
@@ -43,8 +42,7 @@ def measured(dimension: int, kind: str, nodes: list[tuple[str, ...]], noise: dic
     else:
         size = {"range": 1, "speed": 1, "bearing": 1, "azimuth": 1, "inclination": 1}.get(kind, dimension)
         z = rng.uniform(0.2, 3.0, (count, size))
-    constants = {"constants": [0.4]} if kind == "speed" else {}
-    return problem.add(kind, nodes, z, **noise, **constants, loss=loss)
+    return problem.add(kind, nodes, z, **noise, **{"constants": [0.4]} if kind == "speed" else {}, loss=loss)
 
 
 PAIRS = [("a", "b"), ("a", "d"), ("d", "b"), ("d", "e")]

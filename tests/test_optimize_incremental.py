@@ -86,8 +86,9 @@ def test_marginals_are_gtsams_in_the_worlds_directions():
     scale = abs(pose).max()
     assert live.marginal("x9") == pytest.approx(turn @ pose @ turn.T, abs=0.03 * scale)
     assert live.marginal("l1")[:2, :2] == pytest.approx(mark, abs=0.03 * abs(mark).max())
-    exact = joint_covariance(live.problem, live.update(), ("x9",))[0, 0]
-    assert live.marginal("x9") == pytest.approx(exact, abs=0.03 * scale)
+    assert live.marginal("x9") == pytest.approx(
+        joint_covariance(live.problem, live.update(), ("x9",))[0, 0], abs=0.03 * scale
+    )
 
 
 @pytest.mark.parametrize(("z", "std"), [([5e5, 5e6], 3.0), ([20.0, 0.0], 300.0)])
@@ -122,8 +123,9 @@ def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told():
     live, (graph, best) = followed(lag=8), batch()
     assert live["x24"][:2] == pytest.approx(best.atPose2(24).translation(), abs=0.02)
     assert live["l0"][:2] == pytest.approx(best.atPoint2(100), abs=0.02)
-    exact = gtsam.Marginals(graph, best).marginalCovariance(24)
-    assert np.trace(live.marginal("x24")) == pytest.approx(np.trace(exact), rel=0.05)
+    assert np.trace(live.marginal("x24")) == pytest.approx(
+        np.trace(gtsam.Marginals(graph, best).marginalCovariance(24)), rel=0.05
+    )
     assert len(live.isam.calculateEstimate().keys()) < 13
     with refused("lag"):
         live.update()

@@ -61,15 +61,17 @@ def by_torch(known: Measurement, d: int, x: Any, z: Any, constants: Any, steps: 
     rows = [[zero, -w[:, 0]], [w[:, 0], zero]]
     if d == 3:
         rows = [[zero, -w[:, 2], w[:, 1]], [w[:, 2], zero, -w[:, 0]], [-w[:, 1], w[:, 0], zero]]
-    skew = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    turned = x[:, d:].reshape(-1, d, d) @ torch.linalg.matrix_exp(skew)
+    turned = x[:, d:].reshape(-1, d, d) @ torch.linalg.matrix_exp(
+        torch.stack([torch.stack(row, -1) for row in rows], -2)
+    )
     vector, rotation = at[-1] - at[0] if known.arity == 2 else at[0], turned[0]
     if known.frame == "nodes":
         return torch.stack(known.residual(torch.cat([at, turned.flatten(1)], 1).flatten(), z, constants, torch))
     if known.arity == 2 and known.frame != "world":
         vector, rotation = turned[0].T @ vector, turned[0].T @ turned[1]
-    local = [*vector, *rotation.flatten()] if known.frame == "relative" else [*vector]
-    return torch.stack(known.residual(local, z, constants, torch))
+    return torch.stack(
+        known.residual([*vector, *rotation.flatten()] if known.frame == "relative" else [*vector], z, constants, torch)
+    )
 
 
 def errors(known: Measurement, rotations: Any, z: Any) -> Any:

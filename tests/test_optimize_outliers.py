@@ -26,8 +26,9 @@ from coopoc.optimize.solver_commands import solve_file
 def drive(seed: int, steps: int = 400, loops: int = 120, share: float = 0.4) -> tuple[Graph, Bools]:
     """A robot that walks on a grid of streets and closes loops, a share of which is anything; which these are."""
     w = blocks(seed, steps)
-    closed = w.relative(w.near(loops, 1.5), 0.02, 0.01, share)
-    graph = w.graph(relative_pose=joined(w.relative(w.chain(), 0.02, 0.01), closed))
+    graph = w.graph(
+        relative_pose=joined(w.relative(w.chain(), 0.02, 0.01), w.relative(w.near(loops, 1.5), 0.02, 0.01, share))
+    )
     return graph, wrong(graph)
 
 
@@ -94,8 +95,9 @@ def test_the_command_names_what_it_rejects(tmp_path, capsys):
     write_graph(graph, tmp_path / "drive.g2o")
     assert solve_file(tmp_path / "drive.g2o", outliers=True) == 0
     found = json.loads(capsys.readouterr().out)["rejected"]
-    wanted = {tuple(graph.names[i] for i in pair) for pair in graph.relative_pose.nodes[bad].tolist()}
-    assert wanted <= {tuple(pair) for pair in found}
+    assert {tuple(graph.names[i] for i in pair) for pair in graph.relative_pose.nodes[bad].tolist()} <= {
+        tuple(pair) for pair in found
+    }
     chain, _ = drive(1, loops=0)
     write_graph(chain, tmp_path / "chain.g2o")
     with refused("outliers"):

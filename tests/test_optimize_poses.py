@@ -44,14 +44,16 @@ def everything(dimension: int, noise: float = 0.05) -> tuple[Problem, np.ndarray
         nodes = [[names.index(n) for n in c] for c in chosen]
         size, constants = known.size(d), [0.5] * known.constants
         if known.compares_poses:
-            z = np.array([relative(space, truth, c) for c in nodes])
-            moved = space.retract(z, noise * rng.normal(size=(len(nodes), space.dof)))
+            moved = space.retract(
+                np.array([relative(space, truth, c) for c in nodes]), noise * rng.normal(size=(len(nodes), space.dof))
+            )
             problem = problem.add(kind, chosen, moved, std=np.full(size, 0.3))
             continue
         zero = problem.add(kind, chosen, np.full((len(nodes), size), 1.0), std=1.0, constants=constants or None)
         h = zero.linearise(truth).residual[-1] + 1.0
-        measured = h + noise * rng.normal(size=h.shape)
-        problem = problem.add(kind, chosen, measured, std=np.full(size, 0.3), constants=constants or None)
+        problem = problem.add(
+            kind, chosen, h + noise * rng.normal(size=h.shape), std=np.full(size, 0.3), constants=constants or None
+        )
     return problem, truth
 
 
@@ -82,8 +84,9 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     J = problem.whiten(found.x)[1].toarray()[:, movable]
     cov = np.zeros((movable.size, movable.size))
     cov[np.ix_(movable, movable)] = inv(J.T @ J)
-    own = cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)]
-    assert found.covariance == pytest.approx(own, abs=1e-9)
+    assert found.covariance == pytest.approx(
+        cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)], abs=1e-9
+    )
 
 
 def test_a_turned_world_turns_the_estimate():

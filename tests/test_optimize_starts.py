@@ -140,8 +140,7 @@ def test_robust_solves_find_what_the_truth_leads_to(seed):
         return float(np.minimum(problem.whiten(x)[0] ** 2, 6.635).sum())
 
     found = solve_gnc(problem, [0], throw=False)
-    wanted = truncated(solve_gnc(replace(problem, x0=truth), [0], throw=False).x)
-    assert truncated(found.x) <= wanted * (1 + 1e-4)
+    assert truncated(found.x) <= truncated(solve_gnc(replace(problem, x0=truth), [0], throw=False).x) * (1 + 1e-4)
     gone = int((found.extras["weights"] < 0.5).sum())
     assert found.notes[0].startswith(f"GNC rejects {gone} of {len(bad)} candidates; the rest costs")
     lossy = replace(problem, factors=(replace(problem.factors[0], loss=Loss("cauchy", 2.385)),))

@@ -97,8 +97,7 @@ def test_a_long_step_is_two_short_ones(name):
         stream.step(Z + 1.0, U, 0.1)
     twice.step(None, U, 0.1)[0][:] = 0.0  # an estimate is the caller's
     (x, cov), (same_x, same_cov) = once.step(None, U, 0.2), twice.step(None, U, 0.1)
-    near = 1e-6 if name == "net" else 1e-12
-    assert_allclose(x, same_x, atol=near)
+    assert_allclose(x, same_x, atol=1e-6 if name == "net" else 1e-12)
     if cov is not None:
         assert_allclose(cov, same_cov, atol=1e-12)
         assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)

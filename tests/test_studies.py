@@ -47,8 +47,7 @@ def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Res
 
 def test_the_clients_are_drawn_where_they_drive():
     _, _, panel, _ = convergence._clients(drawn("convergence", pd.DataFrame())).figure.axes
-    fleet = co.load_fleet("town10-clients")
-    np.testing.assert_array_equal(panel.lines[0].get_xydata(), fleet.position[:1450, 2, :2])
+    np.testing.assert_array_equal(panel.lines[0].get_xydata(), co.load_fleet("town10-clients").position[:1450, 2, :2])
     assert panel.get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
 
 
@@ -162,8 +161,7 @@ def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_pat
         found = convergence.cell(p)
         assert [row["round"] for row in found] == [0, 0, 1, 1, 2, 2]
         seen = co.observe(town10, scene.sensors(p), co.V2X(max_neighbours=0), runs=2, observers=["town10-00"])
-        begin = town10.position[0, :1] if start == "true" else None
-        alone = LearnedGain(net.after(2), x0=begin)(seen, ["town10-00"])
+        alone = LearnedGain(net.after(2), x0=town10.position[0, :1] if start == "true" else None)(seen, ["town10-00"])
         assert [row["rt_le_m"] for row in found[-2:]] == pytest.approx(rt_le(alone, town10)[:, 0])
 
 

@@ -30,8 +30,7 @@ def test_two_processes_compute_what_one_computes(study, tmp_path):
         before.setattr(sys, "path", [place for place in sys.path if not place.endswith("distribution")])
         assert len(list(compute(repr, [Cell({}, {}, "a"), Cell({}, {}, "b")], 64))) == 2  # type: ignore[arg-type]
         assert reusable_executor._executor._max_workers == 2
-    two = run_study(study, tmp_path / "two", jobs=2)
-    assert numbers(one.frame).equals(numbers(two.frame))
+    assert numbers(one.frame).equals(numbers(run_study(study, tmp_path / "two", jobs=2).frame))
     for name in ("tables/rt_le.csv", "tables/rt_le.tex", "figures/rt_le.pdf", "figures/rt_le.png", "figures/rt_le.svg"):
         assert (tmp_path / "one/small" / name).read_bytes() == (tmp_path / "two/small" / name).read_bytes()
 

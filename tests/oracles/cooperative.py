@@ -35,6 +35,7 @@ from coopoc.kernels.stars.cooperative_messages import (
     FADES,
     FAULTY_SHARE,
     FIX_SCORE,
+    LEAST,
     PENALTY,
     REVOKE_LOG_ODDS,
     TRUST_LOG_ODDS,
@@ -243,6 +244,7 @@ class Oracle:
             "made",
             "supported",
             "shown",
+            "apart",
             "unseen",
             "blind",
             "evidence",
@@ -299,8 +301,7 @@ class Oracle:
         s.late += self.dt
         if s.share < 1:
             return
-        states = [b.x[b.at(*name)] for name in self.fix_terms(self.ego)]
-        error, keep = self.fix[t] - sum(states), exp(-min(s.late, 1.0))
+        error, keep = self.fix[t] - sum([b.x[b.at(*name)] for name in self.fix_terms(self.ego)]), exp(-min(s.late, 1.0))
         if s.weight:
             s.products = [*s.products, (t, error @ s.recent / s.weight)]
         s.recent, s.weight, s.late = keep * s.recent + error, keep * s.weight + 1, 0.0
@@ -543,7 +544,7 @@ class Oracle:
             self.take(t, j)
         if g.fix_gate:
             self.trust()
-            self.doubt_ego()
+            self.follow_majority()
         self.corrected()
         if g.forget:
             step = np.clip(s.learned / (s.information + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
@@ -579,7 +580,9 @@ class Oracle:
             more = far - float(norm(s.gap))
             if more > most or far < 2 * sqrt(r.sum()):
                 s.jumped = more > most
-            s.shown, s.gap, s.unseen = max(s.shown + min(more, most), 0.0), gap, 0.0
+            apart = float(norm(fix - s.belief.x[s.belief.at("x", self.ego)]))
+            s.shown, s.apart = max(s.shown + min(apart - s.apart, most), 0.0), apart
+            s.gap, s.unseen = gap, 0.0
         if self.priors.fix_gate and self.ego not in s.vague:
             self.go_back(t, fix, rows)
             rows = [(self.fix_terms(self.ego), *row[1:]) for row in rows]
@@ -718,8 +721,9 @@ class Oracle:
         near = mean @ solve(v, mean)
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
         v = v + (self.usual(j) if j != self.ego else 0.0) * np.eye(3)
-        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
-        return bool(count >= 3 and enough and odds < -REVOKE_LOG_ODDS)
+        wide = v + min(TAU**2, mean @ mean / 3) * np.eye(3)
+        odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, wide)
+        return bool(count >= LEAST and enough and odds < -REVOKE_LOG_ODDS)
 
     def usual(self, but=-1) -> float:
         """Variance of an error of fixes that nothing is wrong with: of those of the others the lower median distance
@@ -746,11 +750,10 @@ class Oracle:
             if variance:
                 s.belief.add(("b", j), 0.0, variance)
 
-    def doubt_ego(self):
-        """Where none was ever trusted, but most err alike, the ego errs: it goes where they see it."""
-        s, b = self.state, self.state.belief
-        heard = [j for j in s.members if j in s.last]
-        if len(heard) < 2 or s.trusted != {self.ego} or {*s.revoked} - {self.ego}:
+    def follow_majority(self):
+        """More that err alike than are trusted, the ego's own among them, or most: the ego goes where they see it."""
+        s, b, own = self.state, self.state.belief, self.ego not in self.state.trusted
+        if not own and (s.trusted != {self.ego} or {*s.revoked} - {self.ego}):
             return
 
         def far(j, k=None) -> float:
@@ -761,21 +764,27 @@ class Oracle:
             gap = b.x[at] - two * b.x[to]
             return float(gap @ solve(v, gap))
 
-        alike = {j: [k for k in heard if k == j or far(j, k) < FIX_GATE] for j in heard}
-        best = max([j for j in heard if far(j) > WILD], key=lambda j: len(alike[j]), default=None)
-        if best is None or 2 * len(alike[best]) <= len(heard) or len(alike[best]) < 2:
+        heard = [j for j in s.members if j in s.last]
+        early = [self.ego, *(j for j in heard if s.agreed <= 0 or j not in s.revoked)]
+        wrong = [j for j in early if j not in s.trusted and far(j) > WILD]
+        alike = {j: [k for k in wrong if k == j or far(j, k) < FIX_GATE] for j in wrong}
+        best = max([self.ego][: self.ego in wrong] if own else wrong, key=lambda j: len(alike[j]), default=None)
+        if best is None or len(alike[best]) < 2:
+            return
+        if len(alike[best]) <= self.trusted() + 1 if own else 2 * len(alike[best]) <= len(heard):
             return
         x, e = b.at("x", self.ego), b.at("b", best)
-        there, spread = b.x[x] + b.x[e], np.trace(b.p[x, x] + b.p[e, e] + 2 * b.p[x, e]) / 3
+        there, variance = b.x[x] + b.x[e], np.trace(b.p[x, x] + b.p[e, e] + 2 * b.p[x, e])
+        if own and norm(b.x[e]) > s.shown + 2 * sqrt(variance):
+            return
+        before = [self.ego, *s.members]
         for j in list(s.members):
             self.dismiss(j, True, False)
         s.way.clear()
-        s.trusted |= {*alike[best]}
-        for j in alike[best]:
-            s.mean.pop(j, None)
-        self.place(there, spread)
-        self.doubt(self.ego)
-        s.revoked[self.ego] = s.revoked.get(self.ego, 0) + 1
+        self.place(there, variance / 3)
+        for j in before:
+            s.revoked.update({j: s.revoked.get(j, 0) + 1} if j in s.trusted and j not in alike[best] else {})
+            self.doubt(j, 0.0 if j in alike[best] else TAU)
         s.left, s.agreed, s.hits[self.ego] = None, 0.0, 0
 
     def start(self, t, fix: Floats) -> bool:
@@ -1082,8 +1091,7 @@ class Oracle:
         if old:
             before = last.mean[c] + moved[c]
             z = before + (z - before) * weight / (weight - old)
-            full = (steps - 1) * (2 * steps - 1) / (6 * steps)
-            way = (steps - 1 / steps) / 12 if follows else min(full, long)
+            way = (steps - 1 / steps) / 12 if follows else min((steps - 1) * (2 * steps - 1) / (6 * steps), long)
         else:
             n = weight * self.r[new.step, j, c]
             white *= (2 - min(n * (1 - fade), 1)) / (1 + fade)

@@ -123,8 +123,7 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
         predicted = []
         for k in links:
             mine, other = ends(s, k)
-            pair = s[d * drive.own.shape[2] + drive.ends[k, 2]]
-            longer = np.array([mine[6] + pair, 0, 0]) if d > 6 else 0
+            longer = np.array([mine[6] + s[d * drive.own.shape[2] + drive.ends[k, 2]], 0, 0]) if d > 6 else 0
             every = spherical(mine, other, drive.tags[drive.ends[k, :2]]) + longer
             predicted.append(every[np.isfinite(drive.relative[run, k])])
         return np.concatenate(predicted)

@@ -15,7 +15,7 @@ from ..compiling.small import apply, inner_product, load, negate, store, subtrac
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
 from ..geometry import angle
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
-from .cooperative_messages import doubt_ego, fix_terms, goes_on, may_slip, receive, take_fix, trust, use_fix
+from .cooperative_messages import fix_terms, follow_majority, goes_on, may_slip, receive, take_fix, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -369,7 +369,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
         goes_on(f, rows, who[i, ORDER])
     if model.fix_gate > 0.0:
         trust(f, model)
-        doubt_ego(f, model)
+        follow_majority(f, model)
     locate(f)
     ego[STEPS] += 1
     corrected(f)
@@ -416,7 +416,7 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
     q = innovate(f.g, f.h)
     if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, model, FIXES)
-        show(f)
+        show(f, own)
         if model.fix_gate > 0.0 and goes_back(f, model, own, rows, count, q):
             fix_terms(f, 0)
             q = innovate(f.g, f.h)

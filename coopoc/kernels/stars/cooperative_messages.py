@@ -82,7 +82,7 @@ from .gaussian import (
 )
 from .lasting import usual_error
 from .messages import block_at, three_of, vector_at
-from .otherwise import JUMPED, LOUDEST_NOISE, drive, learn_fix, score, turned
+from .otherwise import JUMPED, LOUDEST_NOISE, SHOWN, drive, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -98,8 +98,8 @@ TRUST_LOG_ODDS, PENALTY, REVOKE_LOG_ODDS = 2.0, 4.0, 2.0
 """Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
 MOVES = 0.01
 """Share of the variance of a fix from which the square of a step's motion says that a vehicle does not stand."""
-WINDOW = 30.0
-"""Fixes in the mean innovation of a vehicle."""
+LEAST, WINDOW = 6.0, 30.0
+"""Fixes in the mean innovation of a vehicle: from how many it counts, and the most."""
 
 
 @inside
@@ -372,9 +372,10 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE)
     near, narrow = distance(s, mean)
-    if count < 3.0 or near < 2.0 * (odds + REVOKE_LOG_ODDS):
+    if count < LEAST or near < 2.0 * (odds + REVOKE_LOG_ODDS):
         return False
-    usual, tau2 = usual_error(f, k) if k > 0 else 0.0, TAU**2  # the ego's receiver is compared with all others
+    usual = usual_error(f, k) if k > 0 else 0.0  # the ego's receiver is compared with all others
+    tau2 = min(TAU**2, inner_product(mean, mean) / 3.0)  # the likeliest
     s = add_diagonal(s, (usual, usual, usual))
     near, narrow = distance(s, mean)
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
@@ -423,52 +424,62 @@ def trust(f: Filter, model: Model) -> None:
 
 
 @part
-def doubt_ego(f: Filter, model: Model) -> None:
-    """Where the fixes of most neighbours err by one and the same vector beyond doubt, and none has ever been trusted,
-    it is the ego's receiver that errs: the ego goes where they see it, and they join anew."""
-    who, members = f.who, range(1, len(f.who))
+def follow_majority(f: Filter, model: Model) -> None:
+    """Where more receivers err by one and the same vector beyond doubt than are trusted, the star is where they are
+    not: the ego goes there, they are trusted, and all join anew. The ego's own must be among them, and the way there no
+    longer than it may have slipped; or no neighbour was ever trusted, and most of them agree: it is the ego's that
+    errs."""
+    who, status = f.who, f.status
     g, ego, best, most, others = f.g, who[0, VEHICLE], ABSENT, 1, heard(f, False)
-    if others < 2 or f.status[ego, TRUSTED] == 0.0:
-        return
+    own = status[ego, TRUSTED] == 0.0
     for j in range(len(f.slot)):
-        if j != ego and (f.status[j, TRUSTED] > 0.0 or f.status[j, REVOKED] > 0.0):
+        if not own and j != ego and (status[j, TRUSTED] > 0.0 or status[j, REVOKED] > 0.0):
             return
-    for k in members:
+    for k in range(1 if own else len(who)):
         alike = 0
-        for i in members:
-            alike += difference(f, k, k) > WILD and (i == k or difference(f, k, i) < FIX_GATE)
+        for i in range(len(who)):
+            alike += errs(f, k) and errs(f, i) and (i == k or difference(f, k, i) < FIX_GATE)
         if alike > most:
             best, most = k, alike
-    if 2 * most <= others:
+    if best < 0 or (most <= heard(f, True) + 1 if own else 2 * most <= others):
         return
     first, spread = 3 * g.block[best, ERROR], 0.0
     for c in range(3):
         spread += (g.p[c, c] + g.p[first + c, first + c] + 2.0 * g.p[c, first + c]) / 3.0
-    there = add(vector_at(g.x, 0), vector_at(g.x, first // 3))
-    for k in members:
-        who[k, HITS] = k == best or difference(f, best, k) < FIX_GATE
-    for k in members:
+    way = vector_at(g.x, first // 3)
+    if own and inner_product(way, way) > (f.ego[SHOWN] + 2.0 * math.sqrt(3.0 * spread)) ** 2:
+        return
+    there = add(vector_at(g.x, 0), way)
+    for k in range(len(who)):
+        who[k, HITS] = errs(f, k) and (k == best or difference(f, best, k) < FIX_GATE)
+    for k in range(len(who)):
         j, agrees = who[k, VEHICLE], who[k, HITS] > 0
-        if j >= 0:
+        if j < 0:
+            continue
+        if k > 0:
             dismiss(f, model, k, False)
-            if agrees:
-                set_trust(f, j, 1.0, model.own)
+        status[j, REVOKED] += 0.0 if agrees or status[j, TRUSTED] == 0.0 else 1.0
+        set_trust(f, j, 1.0 if agrees else 0.0, (0.0 if agrees else TAU**2) + model.own)
     clear(g, 0)
     store(g.x, 0, there)
     widen(g, 0, spread)
-    set_trust(f, ego, 0.0, TAU**2 + model.own)
-    f.status[ego, REVOKED] += 1.0
     f.ego[LEFT + 3], f.ego[AGREED], f.member[0, LOCKED], who[0, REJECTED] = NOT_REMEMBERED_M2, 0.0, 0.0, 0
 
 
 @part
+def errs(f: Filter, k: int) -> bool:
+    """Whether a member's fixes, which are not trusted, err beyond doubt; while fixes agree with the ego's position, of
+    a neighbour that never lost trust: what all receivers do at once moves no ego."""
+    j = f.who[k, VEHICLE]
+    if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
+        return False
+    return difference(f, k, k) > WILD and (k == 0 or f.ego[AGREED] <= 0.0 or f.status[j, REVOKED] == 0.0)
+
+
+@part
 def difference(f: Filter, k: int, i: int) -> float:
-    """Squared normalised difference of the errors of two members' fixes, infinite where one has sent none; of one error
-    from 0 where they are the same, 0 then."""
+    """Squared normalised difference of the errors of two members' fixes, from 0 where they are the same."""
     g, h, two = f.g, f.h, 1.0 if i != k else 0.0
-    for m in (k, i):
-        if f.who[m, VEHICLE] < 0 or f.status[f.who[m, VEHICLE], USED] == -math.inf:
-            return math.inf if i != k else 0.0
     a, b = 3 * g.block[k, ERROR], 3 * g.block[i, ERROR]
     for c in range(3):
         for d in range(3):

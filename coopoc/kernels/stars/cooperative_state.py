@@ -127,7 +127,7 @@ was: the ego's are those of its fix."""
 FIVE, NO_VOTES = (0.0,) * 5, (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, BARE, LEFT = 20, 26, 32, 38, 51, 54, 63, 66
-AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, EGO = 73, 74, 75, 76, 84, 93, 94, 97
+AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, OFF, EGO = 73, 74, 75, 76, 84, 93, 94, 97, 98
 """Fields of the ego:
 
 - STEPS, CLOCK, SPAN: number of the step; time s, and time since the last step s.
@@ -144,7 +144,7 @@ AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, EGO = 73, 74, 75, 7
 - CORRECTED: m^2 that fixes add to the variance of this step's motion where they correct it, else 0.
 - ERRORS, VOTES: eight numbers of `lasting`; nine of `gate.vote`.
 - UNSAID: m^2 (sum of the axes) by which the position is more uncertain than its covariance says.
-- OFFSET: ANSWER less the position, m.
+- OFFSET, OFF: ANSWER less the position, m; distance of the last fix from the position, m.
 """
 
 

@@ -66,6 +66,7 @@ from .cooperative_state import (
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
+    OFF,
     OFFSET,
     OWN,
     SINCE_FIX,
@@ -365,20 +366,21 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 
 @part
-def show(f: Filter) -> None:
+def show(f: Filter, own: Floats) -> None:
     """After `innovate`: how far the ego may have slipped unmeasured. That is the distance of its fix, if it grew no
-    faster than the ego drives and fixes err. If it grew faster, the fixes have jumped, which is no slip, until they are
-    near again."""
+    faster than the ego drives and fixes err. If it grew faster, and no known error of its receiver explains that, the
+    fixes have jumped, which is no slip, until they are near again."""
     ego = f.ego
-    far, noise, before = 0.0, 0.0, 0.0
+    far, noise, before, off = 0.0, 0.0, 0.0, 0.0
     for c in range(3):
         before += ego[BEFORE + c] ** 2
         ego[BEFORE + c] = f.h.three[GAP + c]
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
-    far, most = math.sqrt(far), ego[SPEED_OF_LATE] * ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
-    more, ego[SINCE_FIX] = far - math.sqrt(before), 0.0
-    ego[SHOWN] = max(ego[SHOWN] + min(more, most), 0.0)
+        off += (own[FIX + c] - f.g.x[c]) ** 2
+    far, off, most = math.sqrt(far), math.sqrt(off), ego[SPEED_OF_LATE] * ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
+    more, ego[SHOWN] = far - math.sqrt(before), max(ego[SHOWN] + min(off - ego[OFF], most), 0.0)
+    ego[OFF], ego[SINCE_FIX] = off, 0.0
     if more > most or far < 2.0 * math.sqrt(noise):
         ego[JUMPED] = 1.0 if more > most else 0.0
 
