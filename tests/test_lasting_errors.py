@@ -83,7 +83,7 @@ def test_a_slip_is_found_and_ends(town):
     velocity[:, 120:150, [3, 8]] = 0.0
     slips = replace(seen, velocity=velocity)
     (found, track), (without, _) = rms(slips, town), rms(slips, town, slip=0.0)
-    assert found < 0.4 * without
+    assert found < 0.98 < 0.4 * without
     said = track.extras["slips"].mean(axis=(0, 2))
     assert said[128:150].mean() > 0.5
     assert said[:115].max() < 0.1
