@@ -22,7 +22,7 @@ def fixture(fleet: Fleet, neighbours: int, ratio: float = 1.0, sensors: Sensors 
         relative=recording.relative[:, late],
         arrival=recording.arrival[:, late],
     )
-    noise = np.random.default_rng(7).standard_normal(recording.velocity.shape) * np.array([0.707, 0.707, 0.01])
+    noise = np.random.default_rng(7).standard_normal(recording.velocity.shape) * [0.707, 0.707, 0.01]
     return replace(recording, velocity=fleet.velocity + noise * [ratio, ratio, 1.0])
 
 

@@ -117,7 +117,7 @@ def test_an_offset_of_all_ranges_is_a_state():
         assert_allclose(mine - mine[:, :1], 0.0, atol=1e-9)
     assert 0.3 < added[:, [0, -1]].std() < 3.0
     assert_allclose(longer.relative[..., 1:], seen.relative[..., 1:], atol=0)
-    wrong = replace(seen, relative=seen.relative + np.array([3.0, 0.0, 0.0]))
+    wrong = replace(seen, relative=seen.relative + [3.0, 0.0, 0.0])
     cases = (None, seen), (None, wrong), (NoiseModel.nominal(told), wrong)
     clean, taken, state = (
         float(rt_le(CooperativeFilter(model or "nominal")(given), fleet).mean()) for model, given in cases
@@ -177,7 +177,7 @@ def test_seldom_messages_raise_no_level_of_motion():
 def test_wheels_that_slip_leave_the_way_as_it_is(most, factor):
     """Law: while wheels stand still or spin for 5 s, on a bend, too, the error is along the way, and fixes bound it."""
     fleet = load_fleet("town10").between(0, 400)
-    sensors = replace(S2, gnss_std=(0.5, 0.5, 0.5))
+    sensors = replace(S2, gnss_std=(0.5,) * 3)
     for ego in (0, 24):
         seen = observe(fleet, sensors, V2X(most), runs=4, seed=3, observers=[ego])
         velocity = seen.velocity.copy()
@@ -191,7 +191,7 @@ def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step):
     """Law: fixes of half a metre that jump by 24 m are rejected, teach no level of motion and, once they would be used
     again, cost the receiver its trust: a neighbour knows better."""
     fleet = every(load_fleet("town10").between(0, 500), step)
-    sensors, steps = replace(S2, gnss_std=(0.5, 0.5, 0.5)), len(fleet.t)
+    sensors, steps = replace(S2, gnss_std=(0.5,) * 3), len(fleet.t)
     for ego in (0, 12):
         seen = observe(fleet, sensors, V2X(4), runs=2, seed=5, observers=[ego])
         ours, joint = mean_errors(
@@ -280,10 +280,11 @@ def test_fixes_that_stand_are_left_as_soon_as_they_end(ego, repeated):
 
 
 def test_receivers_that_all_jump_alike_are_not_followed_for_seconds():
-    """Law: of 60 worlds whose receivers all leave together for 3 s, few are worse than alone: neighbours see the ego
-    at its fix, and cost 5 to 8 times a Kalman filter where they, or the ego's receiver that they outvote, led it."""
+    """Law: of 84 worlds whose receivers all leave together for 3 s, at most five cost over 3 times a Kalman filter:
+    neighbours see the ego at its fix, and cost 5 to 8 times as much where they, or the ego's receiver that they outvote,
+    led it."""
     ratios = []
-    for seed in range(6000000, 6000060):
+    for seed in range(6000000, 6000084):
         drawn = world(seed, "validation")
         wrong, dt = drawn.recording, drawn.recording.dt
         for second in (10, 24, 36):
@@ -291,7 +292,8 @@ def test_receivers_that_all_jump_alike_are_not_followed_for_seconds():
         ours, alone = mean_errors(wrong, drawn.fleet, drawn.egos, Kalman())
         ratios.append(ours / alone)
     assert np.exp(np.log(ratios).mean()) < 0.65
-    assert np.mean(np.array(ratios) > 3.0) < 0.07
+    assert sorted(ratios)[-6] < 3.0
+    assert max(ratios[43], ratios[66], ratios[83]) < 1.5
 
 
 @pytest.mark.parametrize(("split", "seed", "share"), [("development", 586, 0.3), ("validation", 733, 0.9)])
@@ -311,7 +313,7 @@ def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):
     sensors, t = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02, range_std=0.3), fleet.t - fleet.t[0]
     seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=3, observers=[ego]), 2)
     signs = np.where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
-    velocity = seen.velocity * signs if reverse else seen.velocity + np.array([3.0, 0.0, 0.0])
+    velocity = seen.velocity * signs if reverse else seen.velocity + [3.0, 0.0, 0.0]
     ranges = np.where([True, False, False], seen.relative, nan)
     track = CooperativeFilter(priors=ON_ROADS)(replace(seen, velocity=velocity, relative=ranges), [ego])
     assert errors(track, fleet)[:, 100:].mean() < 2.5

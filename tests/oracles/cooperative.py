@@ -667,10 +667,10 @@ class Oracle:
                 s.revoked[j] = s.revoked.get(j, 0) + 1
             elif not supported:
                 b.noise(("x", j), np.square(z - h @ b.x).sum() / 3)
+            s.agreed *= s.jumped or j != self.ego or j not in s.trusted
             self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
-                s.agreed = s.agreed if s.jumped else 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0 if supported else 1.0

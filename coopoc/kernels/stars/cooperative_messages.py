@@ -298,14 +298,14 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         return 1.0
     judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
+        if k == 0 and ego[JUMPED] == 0.0 and f.status[j, TRUSTED] > 0.0:
+            ego[AGREED] = 0.0
         if not supported:  # neighbours see the ego where the fix is
             gap = vector_at(h.three, GAP // 3)
             widen(g, 0, inner_product(gap, gap) / 3.0)
         elif f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
         set_trust(f, j, 0.0 if supported else 1.0, (TAU**2 if supported else 0.0) + model.own)
-        if k == 0 and ego[JUMPED] == 0.0:
-            ego[AGREED] = 0.0
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             member[0, LOCKED] = 0.0
             fix_terms(f, 0)
