@@ -538,6 +538,8 @@ class Oracle:
                 s.way[j] = self.goes_on(t, j)[0]
             else:
                 self.take(t, j)
+                if new and g.fix_gate and np.isfinite(relative[j][1]):
+                    self.trust()
         at, order = self.nearest()
         self.measure(t, at, order)
         for j in order:

@@ -49,6 +49,7 @@ from .cooperative_state import (
     OUT,
     OWN,
     REJECTED,
+    RELATIVE,
     SINCE_FIX,
     SOLO,
     SPAN,
@@ -358,9 +359,12 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     members = locate(f)
     for i in range(members):
         k = who[i, ORDER]
-        new = f.member[k, EXTRA_VARIANCE] > 0.0 and rows[who[k, INPUT], AGE] >= 0.0
-        if not (new and model.fix_gate > 0.0 and measured_whole(rows, who[k, INPUT])):
+        row = who[k, INPUT]
+        new = f.member[k, EXTRA_VARIANCE] > 0.0 and rows[row, AGE] >= 0.0
+        if not (new and model.fix_gate > 0.0 and measured_whole(rows, row)):
             receive(f, model, rows, k)
+            if new and model.fix_gate > 0.0 and (rows[row, RELATIVE + 1] != 0.0 or rows[row, RELATIVE + 2] != 0.0):
+                trust(f, model)  # or it may be so far from its fix that an azimuth says nothing
         goes_on(f, rows, k)
     locate(f)
     measure(f, model, rows, members)
