@@ -117,7 +117,7 @@ def test_an_offset_of_all_ranges_is_a_state():
         assert_allclose(mine - mine[:, :1], 0.0, atol=1e-9)
     assert 0.3 < added[:, [0, -1]].std() < 3.0
     assert_allclose(longer.relative[..., 1:], seen.relative[..., 1:], atol=0)
-    wrong = replace(seen, relative=seen.relative + [3.0, 0.0, 0.0])
+    wrong = replace(seen, relative=seen.relative + np.array([3.0, 0.0, 0.0]))
     cases = (None, seen), (None, wrong), (NoiseModel.nominal(told), wrong)
     clean, taken, state = (
         float(rt_le(CooperativeFilter(model or "nominal")(given), fleet).mean()) for model, given in cases
@@ -281,8 +281,8 @@ def test_fixes_that_stand_are_left_as_soon_as_they_end(ego, repeated):
 
 def test_receivers_that_all_jump_alike_are_not_followed_for_seconds():
     """Law: of 84 worlds whose receivers all leave together for 3 s, at most five cost over 3 times a Kalman filter:
-    neighbours see the ego at its fix, and cost 5 to 8 times as much where they, or the ego's receiver that they outvote,
-    led it."""
+    neighbours see the ego at its fix, and cost 5 to 8 times as much where they, or the receiver that they outvote, led
+    it."""
     ratios = []
     for seed in range(6000000, 6000084):
         drawn = world(seed, "validation")
@@ -313,7 +313,7 @@ def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):
     sensors, t = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02, range_std=0.3), fleet.t - fleet.t[0]
     seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=3, observers=[ego]), 2)
     signs = np.where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
-    velocity = seen.velocity * signs if reverse else seen.velocity + [3.0, 0.0, 0.0]
+    velocity = seen.velocity * signs if reverse else seen.velocity + np.array([3.0, 0.0, 0.0])
     ranges = np.where([True, False, False], seen.relative, nan)
     track = CooperativeFilter(priors=ON_ROADS)(replace(seen, velocity=velocity, relative=ranges), [ego])
     assert errors(track, fleet)[:, 100:].mean() < 2.5

@@ -89,7 +89,7 @@ def test_a_fitted_noise_model_finds_the_acting_noise(formation):
     fitted = NoiseModel.fitted(training, formation)
     assert fitted.gnss_std == pytest.approx((1.0, 2.0, 3.0), rel=0.02)
     assert fitted.process_std == pytest.approx((0.1, 0.1, 0.1), rel=0.02)
-    late = replace(training, gnss=training.gnss + [2.0, 0.0, 0.0])  # an error that lasts is no less an error
+    late = replace(training, gnss=training.gnss + np.array([2.0, 0.0, 0.0]))  # an error that lasts is no less an error
     assert NoiseModel.fitted(late, formation).gnss_std[0] == pytest.approx(np.hypot(1.0, 2.0), rel=0.01)
 
 

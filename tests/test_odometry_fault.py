@@ -26,7 +26,7 @@ FAULTS: dict[str, Callable[[Floats], Floats]] = {
     "a compass turns": lambda u: turned(u, np.full(u.shape[:-1], 1.0)),
 }
 LOOK_ALIKE: dict[str, Callable[[Floats], Floats]] = {
-    "a receiver jumps": lambda z: z + [30.0, 0.0, 0.0],
+    "a receiver jumps": lambda z: z + np.array([30.0, 0.0, 0.0]),
     "it is displaced at times": lambda z: z + 60.0 * (np.arange(z.shape[1]) % 100 < 30)[:, None, None],
     "it holds its fix": lambda z: np.where(np.arange(z.shape[1])[:, None, None] < 100, z[:, :1], z),
 }

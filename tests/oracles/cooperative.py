@@ -41,7 +41,7 @@ from coopoc.kernels.stars.cooperative_messages import (
     TRUST_LOG_ODDS,
     WINDOW,
 )
-from coopoc.kernels.stars.cooperative_state import ACCELERATION, ESTABLISHED, MAX_LOCKOUT, TAU, WILD
+from coopoc.kernels.stars.cooperative_state import ACCELERATION, ESTABLISHED, MAX_LOCKOUT, TAU, TURN_MEMORY_S, WILD
 from coopoc.kernels.stars.otherwise import (
     AGREEING,
     KNOWN,
@@ -239,7 +239,20 @@ class Oracle:
         self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
 
     def blank(self) -> SimpleNamespace:
-        tables = ("last", "since", "way", "joined", "hits", "mean", "slot", "pace", "locked", "louder", "revoked")
+        tables = (
+            "last",
+            "since",
+            "way",
+            "joined",
+            "hits",
+            "mean",
+            "slot",
+            "pace",
+            "locked",
+            "louder",
+            "bends",
+            "revoked",
+        )
         numbers = (
             "made",
             "supported",
@@ -895,7 +908,8 @@ class Oracle:
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
         g, dt, louder = self.priors, self.dt, self.state.louder
         last, since, variance, slips = self.state.pace.get(j, (u, -inf, q, 0))
-        changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
+        passed = max(t - since, 1) * dt
+        changed = (ACCELERATION * passed) ** 2
         strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
         if g.forget:
             seen = min(t - self.state.began + 1, CHANGES)
@@ -903,6 +917,9 @@ class Oracle:
         if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > WILD and slips < 5:
             self.state.pace[j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2
+        if g.fix_gate and since >= 0:
+            cross, square = exp(-passed / TURN_MEMORY_S) * self.state.bends.get(j, np.zeros(2))
+            self.state.bends[j] = np.array([cross + last[0] * u[1] - last[1] * u[0], square + passed * u[:2] @ u[:2]])
         self.state.pace[j] = u, t, q, 0
         return u, q
 
@@ -1108,6 +1125,14 @@ class Oracle:
         message, (*_, slips) = self.messages[j], self.state.pace.get(j, [0])
         age = (t - self.state.since[j]) * self.dt
         u = np.zeros(3) if message is None else self.state.pace[j][0] if slips else message.velocity
+        if message and j in self.state.bends and not slips:
+            cross, square = self.state.bends[j]
+            signal, noise = (
+                cross**2 / square**2 * u[:2] @ u[:2],
+                message.process[:2].mean() / (self.dt * TURN_MEMORY_S) ** 2,
+            )
+            a = age / 2 * cross / square * max(0.0, 1 - noise / (signal + 1e-12))
+            u = np.array([cos(a) * u[0] - sin(a) * u[1], sin(a) * u[0] + cos(a) * u[1], u[2]])
         return self.turned(j, age * u)
 
     def trust(self):

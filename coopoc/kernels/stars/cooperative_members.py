@@ -8,6 +8,7 @@ from .cooperative_state import (
     ACCELERATION,
     AGE,
     CLOCK,
+    CROSS,
     DT,
     EXTRA_VARIANCE,
     FIX,
@@ -19,6 +20,7 @@ from .cooperative_state import (
     MOTION,
     MOTION_VARIANCE,
     PACE,
+    PACE2,
     REJECTED,
     SINCE,
     SLIPS,
@@ -27,6 +29,7 @@ from .cooperative_state import (
     STEPS,
     TAU,
     TRUSTED,
+    TURN_MEMORY_S,
     VEHICLE,
     WAY,
     WHEN,
@@ -160,7 +163,8 @@ def replace_implausible_velocity(
         unit: m/s of what the row holds.
     """
     dt, status, q = f.ego[SPAN], f.status[j], 0.0
-    changed = (ACCELERATION * max(f.ego[CLOCK] - status[SINCE], dt)) ** 2
+    since = max(f.ego[CLOCK] - status[SINCE], dt)
+    changed = (ACCELERATION * since) ** 2
     for c in range(3):
         gap = unit * row[first + c] - status[PACE + c]
         q += gap * gap / ((row[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
@@ -172,6 +176,10 @@ def replace_implausible_velocity(
         for c in range(3):
             row[first + c], row[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
         return
+    if model.fix_gate > 0.0 and since < math.inf:
+        x, y, keep = unit * row[first], unit * row[first + 1], math.exp(-since / TURN_MEMORY_S)
+        status[CROSS] = keep * status[CROSS] + status[PACE] * y - status[PACE + 1] * x
+        status[PACE2] = keep * status[PACE2] + since * (x * x + y * y)
     status[SINCE], status[SLIPS] = f.ego[CLOCK], 0.0
     for c in range(3):
         status[PACE + c], status[PACE + 3 + c] = unit * row[first + c], row[variance + c]

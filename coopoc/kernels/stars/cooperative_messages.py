@@ -16,6 +16,7 @@ from .cooperative_state import (
     BARE,
     CLOCK,
     COUNT,
+    CROSS,
     ESTABLISHED,
     EXTRA_VARIANCE,
     FIXES,
@@ -34,6 +35,7 @@ from .cooperative_state import (
     OFFSET,
     OUT,
     PACE,
+    PACE2,
     REJECTED,
     REVOKED,
     SLIPS,
@@ -44,6 +46,7 @@ from .cooperative_state import (
     STEP,
     TAU,
     TRUSTED,
+    TURN_MEMORY_S,
     TYPICAL,
     USED,
     VEHICLE,
@@ -252,10 +255,15 @@ def message_rows(
 
 @part
 def goes_on(f: Filter, rows: Floats, k: int) -> bool:
-    """Motion of member k since its newest message, by the velocity in it if plausible, and the derivatives of that
-    motion; False if the message is of this step."""
+    """Motion of member k since its newest message, by the velocity in it if plausible, which turns as far as its turn
+    rate exceeds that one's noise, and the derivatives of that motion; False if the message is of this step."""
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
+    if status[PACE2] > 0.0 and status[SLIPS] == 0.0:
+        rate, x, y = status[CROSS] / status[PACE2], u[0], u[1]
+        noise = 0.5 * (rows[row, STEP] + rows[row, STEP + 1]) / (f.ego[SPAN] * TURN_MEMORY_S) ** 2
+        turn = 0.5 * age * rate * max(0.0, 1.0 - noise / (rate * rate * (x * x + y * y) + 1e-12))
+        u = math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y, u[2]
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
     return bool(age > ROUNDING)
 

@@ -40,7 +40,7 @@ RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5
 """Fields of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none), mean of its fixes m and
 its variance m^2, odometer (sum of all motions) m, velocity m/s, variance of one step's motion m^2 and of a fix m^2."""
 TRUSTED, COUNT, USED, MEAN, LAST, PACE, SINCE, SLIPS = 0, 1, 2, 3, 6, 15, 21, 22
-REVOKED, LOUDER, NOISE, STATUS = 23, 24, 25, 26
+REVOKED, LOUDER, NOISE, CROSS, PACE2, STATUS = 23, 24, 25, 26, 27, 28
 """Fields of a vehicle's status:
 
 - TRUSTED: whether its fixes are assumed to be right.
@@ -51,6 +51,8 @@ REVOKED, LOUDER, NOISE, STATUS = 23, 24, 25, 26
   for never), and how many implausible ones have followed.
 - REVOKED: how often it lost trust.
 - LOUDER: relative increase of the variance of its velocities over the assumed one.
+- CROSS, PACE2: sums, with a memory of TURN_MEMORY_S, of the cross products of velocities that follow each other, and of
+  the times between them times their squares, m^2/s: over these, the turn rate.
 """
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
@@ -63,6 +65,8 @@ TAU = 20.0
 """m, prior standard deviation of a receiver's error."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
+TURN_MEMORY_S = 2.0
+"""s, after which a velocity weighs 1 / e in the turn rate."""
 FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 13
 """Kinds of numbers with a level, after ranges, azimuths and inclinations; number of these kinds, and of errors."""
 
