@@ -296,9 +296,14 @@ def test_receivers_that_all_jump_alike_are_not_followed_for_seconds():
     assert max(ratios[43], ratios[66], ratios[83]) < 1.5
 
 
-@pytest.mark.parametrize(("split", "seed", "share"), [("development", 586, 0.3), ("validation", 733, 0.9)])
-def test_receivers_that_agree_move_an_ego_that_slipped_and_small_errors_end_trust(split, seed, share):
-    """Law: beside liars that creep, and with multipath; 0.75 and 1.5 times a Kalman filter before."""
+@pytest.mark.parametrize(
+    ("split", "seed", "share"),
+    [("development", 586, 0.3), ("validation", 733, 0.9), ("development", 139, 0.7), ("development", 1896, 0.8)],
+)
+def test_single_worlds_stay_better_than_alone(split, seed, share):
+    """Law: receivers that agree move an ego that slipped beside liars that creep; a small error of multipath ends
+    trust; angles of a degree alone count at once; messages that are 0.56 s late follow a circle. It was 0.75, 1.5, 0.74
+    and 1.69 times a Kalman filter."""
     drawn = world(seed, split)
     ours, alone = mean_errors(drawn.recording, drawn.fleet, drawn.egos, Kalman())
     assert ours < share * alone

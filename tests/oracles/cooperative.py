@@ -15,7 +15,6 @@ import numpy as np
 from numpy import nan
 from numpy.linalg import norm, slogdet, solve
 
-from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import (
     AWAY,
@@ -60,7 +59,6 @@ from coopoc.kernels.stars.otherwise import (
     UNTRUSTED,
     USUAL_SQUARE,
 )
-from coopoc.methods.cooperative_filter import Priors
 from coopoc.methods.odometry_fault import with_odometry
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
@@ -79,18 +77,18 @@ class Belief:
         self.names: list[Name] = []
         self.x, self.p = np.zeros(0), np.zeros((0, 0))
 
-    def at(self, *name: Any) -> slice:
+    def at(self, *name):
         k = self.names.index(name)
         return slice(3 * k, 3 * k + 3)
 
-    def add(self, name: Name, mean: Any, variance: Any):
+    def add(self, name, mean, variance):
         n = len(self.x)
         p = np.zeros((n + 3, n + 3))
         p[:n, :n], p[n:, n:] = self.p, np.diag(np.broadcast_to(variance, 3))
         self.names.append(name)
         self.x, self.p = np.append(self.x, np.broadcast_to(mean, 3)), p
 
-    def transform(self, name: Name, terms: dict[Name, float]):
+    def transform(self, name, terms):
         """The vector becomes a sum of others."""
         f = np.eye(len(self.x))
         f[self.at(*name)] = 0
@@ -98,18 +96,18 @@ class Belief:
             f[self.at(*name), self.at(*other)] = factor * np.eye(3)
         self.x, self.p = f @ self.x, f @ self.p @ f.T
 
-    def drop(self, name: Name):
+    def drop(self, name):
         if name in self.names:
             keep = np.ones(len(self.x), bool)
             keep[self.at(*name)] = False
             self.names.remove(name)
             self.x, self.p = self.x[keep], self.p[np.ix_(keep, keep)]
 
-    def noise(self, name: Name, variance: Any):
+    def noise(self, name, variance):
         at = self.at(*name)
         self.p[at, at] += np.diag(np.broadcast_to(variance, 3))
 
-    def row(self, terms: dict[Name, Any], axis) -> Floats:
+    def row(self, terms, axis):
         """h of one number: a vector's factor is one for its axis, or three for its numbers."""
         h = np.zeros(len(self.x))
         for name, factor in terms.items():
@@ -119,11 +117,11 @@ class Belief:
                 h[self.at(*name).start + axis] = factor
         return h
 
-    def update(self, h: Floats, z: float, r: float, gate: float = 0.0) -> float:
+    def update(self, h, z, r, gate=0.0):
         """One number; its squared normalised innovation."""
         return self.updates(h[None], np.array([z]), np.array([r]), gate)
 
-    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, share: float = 1.0) -> float:
+    def updates(self, h, z, r, gate=0.0, share=1.0):
         """Several numbers with one gate, or a share of their information; their squared Mahalanobis distance."""
         gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
         q = float(gap @ solve(s, gap))
@@ -134,7 +132,7 @@ class Belief:
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
 
-    def average(self, which: list[int], prior: Any, odds: float):
+    def average(self, which, prior, odds):
         """All of these numbers are 0, or N(0, prior)."""
         some = [i for i in which if self.p[i, i] > 0]
         if not some or odds == -inf:
@@ -174,7 +172,7 @@ class Life(NamedTuple):
     absent: Floats
 
 
-def fresh(gnss: Floats, moved: Floats, variance: Floats) -> Floats:
+def fresh(gnss, moved, variance):
     """Fixes (T, N, 3) but those that repeat the last one of their receiver, whose vehicle has moved."""
     new, last = gnss.copy(), np.full(gnss.shape[1:], nan)
     moves = np.square(moved).sum(-1) > 0.01 * variance[..., 0]
@@ -187,7 +185,7 @@ def fresh(gnss: Floats, moved: Floats, variance: Floats) -> Floats:
 class Oracle:
     """The filter of one ego in one run."""
 
-    def __init__(self, seen: Recording, ego, run, known: NoiseModel, priors: Priors):
+    def __init__(self, seen, ego, run, known, priors):
         s, measured, self.more = known.sensors, seen.velocity, np.zeros(len(seen.t))
         if priors.fix_gate:  # `test_odometry_fault` has what refers to that
             seen, fault = with_odometry(seen, [ego], known, priors.fix)
@@ -223,7 +221,7 @@ class Oracle:
         self.deaf = False
         self.reset()
 
-    def remember(self, gnss: Floats, velocity: Floats):
+    def remember(self, gnss, velocity):
         """What every vehicle sends: a mean of its fixes, each of which fades with its age."""
         self.mean, self.weight, self.odometer = (np.zeros(gnss.shape) for _ in range(3))
         m, w, o = np.zeros((3, *gnss.shape[1:]))
@@ -238,7 +236,7 @@ class Oracle:
         self.state, self.lone = self.blank(), None
         self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
 
-    def blank(self) -> SimpleNamespace:
+    def blank(self):
         tables = (
             "last",
             "since",
@@ -280,7 +278,7 @@ class Oracle:
             trusted={self.ego} if self.priors.fix_gate else set(range(self.seen.gnss.shape[2])),
         )
 
-    def loop(self) -> tuple[Floats, Floats, list[Floats]]:
+    def loop(self):
         """x (T, 3), covariance (T, 3, 3), neighbours (k, 3) of each step."""
         found: list[Any] = []
         for t in range(len(self.seen.t)):
@@ -319,7 +317,7 @@ class Oracle:
             s.products = [*s.products, (t, error @ s.recent / s.weight)]
         s.recent, s.weight, s.late = keep * s.recent + error, keep * s.weight + 1, 0.0
 
-    def lasting(self, t) -> float:
+    def lasting(self, t):
         if not (self.priors.forget and self.state.products):
             return 0.0
         when, p = np.array(self.state.products).T
@@ -328,10 +326,10 @@ class Oracle:
         c, error = w @ p / n, w @ p**2 / n * max(2 / np.clip(seconds, 1, 100), 1 / n)
         return float(max(c - error / c, 0.0)) if c > 0 else 0.0
 
-    def others(self) -> float:
+    def others(self):
         return 3 * self.usual() / (1 + self.trusted()) if self.priors.forget else 0.0
 
-    def answer(self) -> tuple[Floats, Floats]:
+    def answer(self):
         """Position and covariance, averaged over which errors are there."""
         b = copy.deepcopy(self.state.belief)
         self.average(b)
@@ -339,7 +337,7 @@ class Oracle:
         self.state.cov, self.state.off = np.diag(b.p[x, x]), b.x[x] - self.state.belief.x[x]
         return b.x[x], b.p[x, x]
 
-    def compare(self, t, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
+    def compare(self, t, x, cov):
         """Beside the star, the ego alone: whose answer counts?"""
         if self.lone is None:
             return x, cov
@@ -368,7 +366,7 @@ class Oracle:
                 self.left = self.last
         return (y, q) if self.left > 0 else (x, cov)
 
-    def average(self, b: Belief):
+    def average(self, b):
         life, slot = self.life, self.state.slot
         members = sorted((self.ego, *self.state.members), key=lambda j: -slot[j])
         turns = [b.at("o", j).start + i for j in members if ("o", j) in b.names for i in range(3)]
@@ -383,7 +381,7 @@ class Oracle:
             turns = [i for k, i in enumerate(turns) if k % 3 < 2]
             b.average(turns, np.tile(life.turn[:2], len(members)), self.priors.exact * max(len(members), 2))
 
-    def motion(self, t) -> tuple[Floats, Floats]:
+    def motion(self, t):
         """The ego's velocity and the variance of its motion, corrected by fixes or not."""
         u, q = self.u[t], self.q[t, self.ego]
         return (u, q + self.grown) if self.corrected_now else (u - self.by[t], q)
@@ -428,13 +426,13 @@ class Oracle:
             self.pending = KNOWN
         self.state.slips = 1 / (1 + exp(min(-odds, 700)))
 
-    def count(self, q: float, logdet: float, numbers):
+    def count(self, q, logdet, numbers):
         """What the numbers of an update say of a slip."""
         self.state.score -= 0.5 * (q + logdet)
         self.state.numbers += numbers
         self.state.squares += q
 
-    def neighbours(self, t) -> tuple[Any, list[int]]:
+    def neighbours(self, t):
         """Links of a step, and the columns that they join."""
         here = np.arange(self.box.start[t], self.box.start[t + 1])
         return here, self.seen.links.neighbour[self.box.link[here]].tolist()
@@ -446,7 +444,7 @@ class Oracle:
         self.relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
         self.messages = {j: self.message(link, j) for j, link in links.items()}
 
-    def places(self, t, fix: Floats) -> list[Any]:
+    def places(self, t, fix):
         """Where the ego may be, and the variance: by its fix, and by each neighbour."""
         found = [(fix.copy(), self.r[t, self.ego])] if np.isfinite(fix).all() else []
         for j, message in self.messages.items():
@@ -455,7 +453,7 @@ class Oracle:
                 found.append((message.mean + late - to_vector(self.relative[j]), 1 / message.weight + 1))
         return found
 
-    def message(self, link, j) -> Sent | None:
+    def message(self, link, j):
         """The newest one that is held."""
         s = int(self.box.newest[self.run, link])
         if s < 0:
@@ -463,18 +461,18 @@ class Oracle:
         velocity, q = self.seen.velocity[self.run, s, j], self.louder(j) * self.q[s, j]
         return Sent(s, self.mean[s, j], self.weight[s, j], self.odometer[s, j], velocity, q)
 
-    def louder(self, j) -> float:
+    def louder(self, j):
         """Level of a vehicle's motion."""
         s, few = self.state, self.state.mean.get(j, (0.0, 0.0))[0] < AGREEING
         doubted = few and j in s.last and j not in s.trusted and j != self.ego
         return (UNTRUSTED if doubted else 1.0) * exp(s.level[5]) * float(s.louder.get(j, 1.0))
 
-    def learn(self, kind, more: float, share: float, numbers=1):
+    def learn(self, kind, more, share, numbers=1):
         """What innovations show of a level: derivative and information of their log-likelihood."""
         self.state.learned[kind] += 0.5 * numbers * share * more
         self.state.information[kind] += 0.5 * numbers * share**2
 
-    def own_variance(self) -> Any:
+    def own_variance(self):
         return np.diag(self.state.belief.p)[self.state.belief.at("x", self.ego)].sum()
 
     def corrected(self):
@@ -498,7 +496,7 @@ class Oracle:
         s.trusted.add(self.ego)
         self.start(t, self.fix[t].copy())
 
-    def step(self, t, slip: float):
+    def step(self, t, slip):
         s, g, b = self.state, self.priors, self.state.belief
         s.score = s.numbers = s.squares = s.share = 0.0
         s.now = slip > 0
@@ -572,20 +570,20 @@ class Oracle:
         s.learned = np.zeros(6)
         s.information = s.information * (exp(-dt / g.forget) if g.forget else 1.0)
 
-    def nearest(self) -> tuple[dict[int, Floats], list[int]]:
+    def nearest(self):
         """Where ego and members are now, and the members, nearest first."""
         s, b = self.state, self.state.belief
         at = {j: b.x[b.at("x", j)] + s.way.get(j, 0.0) for j in (self.ego, *s.members)}
         return at, sorted(s.members, key=lambda j: float(norm(at[j] - at[self.ego])))
 
-    def dismiss(self, j, measured: bool, doubted: bool):
+    def dismiss(self, j, measured, doubted):
         if measured and (doubted or j not in self.state.trusted):
             self.doubt(j)
         for kind in "xbor":
             self.state.belief.drop((kind, j))
         self.state.members.remove(j)
 
-    def add_fix(self, t, fix: Floats):
+    def add_fix(self, t, fix):
         s, louder, way = self.state, exp(self.state.level[3]), self.state.speed * self.state.unseen
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s.vague:
@@ -604,12 +602,12 @@ class Oracle:
         s.share = self.use_fix(t, self.ego, rows, True, self.may_slip(self.r[t, self.ego] * self.white, way**2))
         self.corrected()
 
-    def keep_place(self, more: float):
+    def keep_place(self, more):
         s, b, at = self.state, self.state.belief, self.state.belief.at("x", self.ego)
         s.left = b.x[at].copy(), (np.trace(b.p[at, at]) + more) / 3
         s.evidence = s.agree = s.driven = 0.0
 
-    def go_back(self, t, fix: Floats, rows: list[Any]):
+    def go_back(self, t, fix, rows):
         """To where the ego was before fixes contradicted it, if it is there again."""
         s, b = self.state, self.state.belief
         q, gap, cov, r = self.mahalanobis(b, rows)
@@ -636,7 +634,7 @@ class Oracle:
         elif near and s.agree > AWAY:
             s.left = None
 
-    def learn_fix(self, kind, rows: list[Any]):
+    def learn_fix(self, kind, rows):
         _, gap, cov, r = self.mahalanobis(self.state.belief, rows)
         total, s = np.trace(cov) + r.sum(), self.state
         change, square = np.square(gap - s.gap).sum() / 2 / total, gap @ gap / total
@@ -646,23 +644,23 @@ class Oracle:
         if kind == 3 and not (wild and (s.jumped or change > SUDDEN)):
             self.learn(5, min(square, SUDDEN) - 1, s.made / total, 3)
 
-    def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
+    def mahalanobis(self, b, rows):
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
         h = np.array([b.row(row[0], c) for c, row in enumerate(rows)])
         gap, r = np.array([row[1] for row in rows]) - h @ b.x, np.array([row[2] for row in rows])
         cov = h @ b.p @ h.T
         return float(gap @ solve(cov + np.diag(r), gap)), gap, cov, r
 
-    def may_slip(self, fix: Floats, way2: float) -> float:
+    def may_slip(self, fix, way2):
         return min(SLIP_M2, max(float(np.mean(fix)), 0.25 * way2))
 
-    def use_fix(self, t, j, rows: list[Any], again: bool, slip: float) -> float:
+    def use_fix(self, t, j, rows, again, slip):
         """The share of its information that is used."""
         share, hits = self.share_of(t, j, rows, again, slip), self.state.hits
         hits[j] = hits.get(j, 0) + 1 if share < 1 else 0
         return share
 
-    def share_of(self, t, j, rows: list[Any], again: bool, slip: float) -> float:
+    def share_of(self, t, j, rows, again, slip):
         """That share, the less, the more in a row were rejected; trust may be revoked."""
         s, g, b = self.state, self.priors, self.state.belief
         used = [c for c, row in enumerate(rows) if row is not None]
@@ -713,16 +711,16 @@ class Oracle:
             b.updates(h, z, r, share=share)
         return share
 
-    def wrong(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
+    def wrong(self, j, q, gap, cov, r):
         """On average, or locked out, the ego beside a neighbour that is trusted."""
         locked = q > self.priors.fix_gate and self.state.locked.get(j, 0.0) >= PATIENCE
         return self.wrong_on_average(j, q, gap, cov, r) or (locked and (j != self.ego or self.trusted() > 0))
 
-    def trusted(self) -> int:
+    def trusted(self):
         """How many members are trusted, of those that have sent a message."""
         return sum(j in self.state.last and j in self.state.trusted for j in self.state.members)
 
-    def wrong_on_average(self, j, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
+    def wrong_on_average(self, j, q, gap, cov, r):
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
         s, g = self.state, self.priors
         count, mean, noise = s.mean.get(j, (0.0, np.zeros(3), 0.0))
@@ -740,7 +738,7 @@ class Oracle:
         odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, wide)
         return bool(count >= LEAST and enough and odds < -REVOKE_LOG_ODDS)
 
-    def usual(self, but=-1) -> float:
+    def usual(self, but=-1):
         """Variance of an error of fixes that nothing is wrong with: of those of the others the lower median distance
         from the nearest."""
         s, b, errors = self.state, self.state.belief, list[Any]()
@@ -771,7 +769,7 @@ class Oracle:
         if not own and (s.trusted != {self.ego} or {*s.revoked} - {self.ego}):
             return
 
-        def far(j, k=None) -> float:
+        def far(j, k=None):
             """From one another, or from 0."""
             at, to = b.at("b", j), b.at("b", j if k is None else k)
             two, cross = float(k is not None), b.p[at, to]
@@ -802,7 +800,7 @@ class Oracle:
             self.doubt(j, 0.0 if j in alike[best] else TAU)
         s.left, s.agreed, s.hits[self.ego] = None, 0.0, 0
 
-    def start(self, t, fix: Floats) -> bool:
+    def start(self, t, fix):
         """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""
         s, g = self.state, self.priors
         places, votes = self.places(t, fix), [1]
@@ -824,7 +822,7 @@ class Oracle:
             s.vague.discard(self.ego)
         return True
 
-    def place(self, x: Floats, variance: Any):
+    def place(self, x, variance):
         """The ego anew, whose fixes are trusted."""
         s, b = self.state, self.state.belief
         b.drop(("b", self.ego))
@@ -837,7 +835,7 @@ class Oracle:
         s.mean.pop(self.ego, None)
         s.locked.pop(self.ego, None)
 
-    def outvoted(self, t, fix: Floats) -> bool:
+    def outvoted(self, t, fix):
         """Do more fixes agree with one another elsewhere than with the start, and no more neighbours with that?"""
         votes, r, (u, q) = self.state.votes, self.r[t, self.ego] * self.white, self.motion(t)
         if votes and votes[0][1] >= CONFIRMED:
@@ -859,11 +857,11 @@ class Oracle:
         b = self.state.belief
         return self.speak_for(t, b.x[b.at("x", self.ego)] + self.dt * u, fix) <= 0
 
-    def speak_for(self, t, here: Floats, there: Floats):
+    def speak_for(self, t, here, there):
         """How much nearer do neighbours put the ego to one place than to another?"""
         return sum(self.off(t, there)) - sum(self.off(t, here))
 
-    def off(self, t, place: Floats) -> list[float]:
+    def off(self, t, place):
         """How far is a place from where each neighbour puts the ego?"""
         std, found = self.std * np.exp(self.state.level[:3] / 2), []
         for j, message in self.messages.items():
@@ -880,7 +878,7 @@ class Oracle:
             found.append(min(float(q), FIX_GATE))
         return found
 
-    def lost(self, t) -> bool:
+    def lost(self, t):
         s = self.state
         held = [j for j in s.members if j in s.last]
         if self.trusted():
@@ -895,16 +893,16 @@ class Oracle:
         agree = error @ error > FIX_GATE * noise and apart[:1] < [FIX_GATE * noise]
         return len(held) >= 2 or bool(len(held) == 1 and (error @ error > WILD * noise or agree))
 
-    def contradicted(self, t, j) -> bool:
+    def contradicted(self, t, j):
         hits, since = self.state.hits[("relative", j)], t - self.state.joined[j]
         most = max(hits)
         return bool(most >= min(CONTRADICTED, max(2, since - most)) or sum(n >= 3 for n in hits) >= 2)
 
-    def fix_terms(self, j) -> dict[Name, float]:
+    def fix_terms(self, j):
         names = [("x", j), ("b", j), ("common",)]
         return {name: 1.0 for name in names if name in self.state.belief.names}
 
-    def steady(self, t, j, u: Floats, q: Floats) -> tuple[Floats, Floats]:
+    def steady(self, t, j, u, q):
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
         g, dt, louder = self.priors, self.dt, self.state.louder
         last, since, variance, slips = self.state.pace.get(j, (u, -inf, q, 0))
@@ -923,7 +921,7 @@ class Oracle:
         self.state.pace[j] = u, t, q, 0
         return u, q
 
-    def predict(self, moved: Floats, q: Floats):
+    def predict(self, moved, q):
         b, life = self.state.belief, self.life
         self.drive(self.ego, moved)
         b.noise(("x", self.ego), q)
@@ -944,12 +942,12 @@ class Oracle:
         if self.life.turn.any():
             self.state.belief.add(("o", j), 0.0, self.life.turn)
 
-    def turn(self, j) -> Floats:
+    def turn(self, j):
         """Errors of an odometry, where they are linear."""
         b: Belief = self.state.belief
         return b.x[b.at("o", j)]
 
-    def turned(self, j, moved: Floats) -> tuple[Floats, Floats]:
+    def turned(self, j, moved):
         """A motion by odometry, corrected, and its derivatives by the errors of it."""
         b, by = self.state.belief, np.zeros((3, 3))
         if ("o", j) not in b.names or (j == self.ego and self.corrected_now):
@@ -960,7 +958,7 @@ class Oracle:
         by[:2, 0], by[:2, 1] = [-way[1], way[0]], way / (1 + scale)
         return np.append(way, moved[2]), by
 
-    def drive(self, j, moved: Floats, steps=1):
+    def drive(self, j, moved, steps=1):
         b, (way, by) = self.state.belief, self.turned(j, moved)
         b.x[b.at("x", j)] += way
         if j == self.ego and self.state.left:
@@ -975,7 +973,7 @@ class Oracle:
         b.x[o] *= holds
         b.noise(("o", j), (1 - holds**2) * self.life.turn)
 
-    def near(self, j) -> Floats:
+    def near(self, j):
         """Where the ego measures a vehicle."""
         b, relative = self.state.belief, self.relative[j]
         far = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
@@ -1003,7 +1001,7 @@ class Oracle:
         if variance:
             b.add(("b", j), 0.0, variance)
 
-    def measure(self, t, at: dict[int, Floats], order: list[int]):
+    def measure(self, t, at, order):
         """Linear at the prediction."""
         b = self.state.belief
         if order and ("compass",) in b.names:
@@ -1013,7 +1011,7 @@ class Oracle:
         for j in order:
             self.relate(t, j, at)
 
-    def relate(self, t, j, at: dict[int, Floats]):
+    def relate(self, t, j, at):
         relative, message = self.relative[j], self.messages[j]
         s, g, there = self.state, self.priors, np.isfinite(relative)
         b, vague, hits = s.belief, j in s.vague, s.hits[("relative", j)]
@@ -1072,7 +1070,7 @@ class Oracle:
         self.messages[j] = self.receive(t, j, self.messages[j])
         self.state.way[j] = self.goes_on(t, j)[0]
 
-    def receive(self, t, j, message: Sent | None) -> Sent | None:
+    def receive(self, t, j, message):
         """Move to where the newest message was sent, use the fixes since the last one; the message as it is used."""
         s, dt, last = self.state, self.dt, self.state.last.get(j)
         b, since = s.belief, s.since[j]
@@ -1098,7 +1096,7 @@ class Oracle:
         s.last[j], s.since[j] = message, message.step
         return message._replace(process=q)
 
-    def said(self, new: Sent, last: Any, j, q: Any, moved: Any, steps, follows: bool, c) -> Any:
+    def said(self, new, last, j, q, moved, steps, follows, c):
         """Terms, number and variance of the mean of the fixes since the last message, None for none."""
         fade, weight, z = exp(-self.dt / FADES), new.weight[c], new.mean[c]
         old = fade**steps * last.weight[c] if last else 0.0
@@ -1120,7 +1118,7 @@ class Oracle:
             terms["o", j] = np.outer(-new.velocity, [0, 0, 1])
         return terms, z, white + way * q[c]
 
-    def goes_on(self, t, j) -> tuple[Floats, Floats]:
+    def goes_on(self, t, j):
         """The way since the newest message, and its derivatives by the errors of odometry."""
         message, (*_, slips) = self.messages[j], self.state.pace.get(j, [0])
         age = (t - self.state.since[j]) * self.dt
@@ -1161,6 +1159,6 @@ class Oracle:
                 b.drop(("b", best))
 
 
-def normal(x: Floats, cov: Floats) -> float:
+def normal(x, cov):
     """Logarithm of the density of N(0, cov)."""
     return float(-0.5 * (slogdet(2 * pi * cov)[1] + x @ solve(cov, x)))
