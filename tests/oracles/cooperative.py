@@ -1129,7 +1129,7 @@ class Oracle:
                 cross**2 / square**2 * u[:2] @ u[:2],
                 message.process[:2].mean() / (self.dt * TURN_MEMORY_S) ** 2,
             )
-            a = age / 2 * cross / square * max(0.0, 1 - noise / (signal + 1e-12))
+            a = (age + self.dt) / 2 * cross / square * max(0.0, 1 - noise / (signal + 1e-12))
             u = np.array([cos(a) * u[0] - sin(a) * u[1], sin(a) * u[0] + cos(a) * u[1], u[2]])
         return self.turned(j, age * u)
 

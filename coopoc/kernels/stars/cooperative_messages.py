@@ -262,7 +262,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     if status[PACE2] > 0.0 and status[SLIPS] == 0.0:
         rate, x, y = status[CROSS] / status[PACE2], u[0], u[1]
         noise = 0.5 * (rows[row, STEP] + rows[row, STEP + 1]) / (f.ego[SPAN] * TURN_MEMORY_S) ** 2
-        turn = 0.5 * age * rate * max(0.0, 1.0 - noise / (rate * rate * (x * x + y * y) + 1e-12))
+        turn = 0.5 * (age + f.ego[SPAN]) * rate * max(0.0, 1.0 - noise / (rate * rate * (x * x + y * y) + 1e-12))
         u = math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y, u[2]
     store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
     return bool(age > ROUNDING)
