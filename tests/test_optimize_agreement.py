@@ -18,26 +18,26 @@ from random_graphs import AB, random_graph, star
 from shell import ROOT
 
 from coopoc import V2X, Sensors, load_fleet, observe
-from coopoc.optimize import Backend, Loss, Problem, Solution, Status, backends, solve, solve_gnc
+from coopoc.optimize import Backend, Loss, Problem, Status, backends, solve, solve_gnc
 from coopoc.optimize.backend import require_backend
 from coopoc.optimize.convex.relaxation import shor
 from coopoc.optimize.graph_problems import from_graph
 
 
-def spherical() -> Problem:
+def spherical():
     """A snapshot of town10 with up to ten neighbours, range, azimuth and inclination."""
     seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X(10), runs=1, observers=[24])
     return Problem.from_snapshot(seen, 30, 24)
 
 
-def drive(dimension: int, objective: Any) -> Problem:
+def drive(dimension, objective):
     """Two robots of six poses each from the truth: odometry, loops, and ranges between them, the first pose held."""
     return from_graph(
         random_graph(3, dimension, steps=6, landmarks=0, loops=4, ranges=8, seen=0, step_std=0.1), objective, "file"
     )
 
 
-def linear() -> Problem:
+def linear():
     """Fixes and displacements with full covariances."""
     rng = np.random.default_rng(5)
     names = [f"v{k}" for k in range(8)]
@@ -48,7 +48,7 @@ def linear() -> Problem:
     )
 
 
-def bounded() -> Problem:
+def bounded():
     """The linear case with a height that must not fall below what it would."""
     free = linear()
     return free.constrain("position", free.names, [[-np.inf, -np.inf, solve(free).position[:, 2].min() + 0.8]] * 8)
@@ -84,12 +84,12 @@ RELAXED = {("cvxpy", "linear"), ("cvxpy", "range-only"), ("cvxpy", "SE(2) chorda
 
 
 @cache
-def case(name: str) -> Problem:
+def case(name):
     return CASES[name]()
 
 
 @cache
-def reference(name: str) -> Solution:
+def reference(name):
     if name != "active bound":
         return solve(case(name))
     return solve(case(name), "casadi")

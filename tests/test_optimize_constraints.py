@@ -19,7 +19,6 @@ from coopoc.optimize import (
     Capabilities,
     Loss,
     Problem,
-    Solution,
     SolveError,
     SolverResult,
     Status,
@@ -56,14 +55,14 @@ def kinds():
     del MEASUREMENTS["height"], MEASUREMENTS["plane"]
 
 
-def solved(problem: Problem, backend: str = "casadi") -> Solution:
+def solved(problem, backend="casadi"):
     solution = solve(problem, backend)
     assert solution.status is Status.SOLVED
     assert solution.violation < 1e-8
     return solution
 
 
-def gradient(problem: Problem, x: np.ndarray) -> np.ndarray:
+def gradient(problem, x):
     r, J = problem.whiten(x)
     return J.T @ r
 
@@ -80,7 +79,7 @@ def test_a_fix_on_a_plane_is_projected(seed):
     assert solution.cost == pytest.approx(0.5 * (n @ p - c) ** 2 / (n @ S @ n), rel=1e-9)
 
 
-def chain(points: int, seed: int) -> Problem:
+def chain(points, seed):
     """A random walk with odometry 100 times as sure as the fixes: a linear problem."""
     rng = default_rng(seed)
     truth = np.cumsum(rng.normal(size=(points, 3)), axis=0)
@@ -118,7 +117,7 @@ def test_constraints_that_do_not_push_change_nothing(dense, length, backend):
     same_minimum(solved(wide, backend), free)
 
 
-def drive(seed: int, vehicles: int = 2, steps: int = 4) -> Problem:
+def drive(seed, vehicles=2, steps=4):
     """Vehicles on the road, with fixes, odometry that runs ahead and ranging to the one in front."""
     rng = default_rng(seed)
     t = 0.5 * np.arange(steps)[:, None]
@@ -139,7 +138,7 @@ def drive(seed: int, vehicles: int = 2, steps: int = 4) -> Problem:
     return problem.constrain("speed", moved, upper=14.0, constants=[0.5])
 
 
-def scipys(problem: Problem) -> tuple[np.ndarray, float]:
+def scipys(problem):
     """SciPy on the same problem: its cost and gradient are ours, the constraints and their derivatives written here."""
     n = len(problem.names)
     moved = next(f.nodes for f in problem.factors if f.kind == "displacement")
@@ -261,7 +260,7 @@ def test_poses_in_a_slab():
     assert abs(first.position[:, 1]).max() == pytest.approx(0.5, abs=1e-9)
 
 
-def east(problem: Problem, node: str, lower: float = -INF, upper: float = INF) -> Problem:
+def east(problem, node, lower=-INF, upper=INF):
     return problem.constrain("position", node, [lower, -INF, -INF], [upper, INF, INF])
 
 

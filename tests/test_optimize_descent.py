@@ -22,6 +22,15 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes():
     assert np.array(found) == pytest.approx(np.c_[0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)], abs=1e-6)
 
 
+def test_what_hangs_on_a_weak_and_far_anchor_is_solved_to_rounding():
+    """Closed form: exact differences; FAILED before, 3 km off."""
+    truth = 1e7 + np.arange(60.0).reshape(20, 3) % 7
+    problem = Problem(range(20)).add("position", 0, truth[0], std=1e4)
+    std = np.where(np.arange(19) % 2, 0.1, 1e-3)[:, None] * np.ones(3)
+    problem = problem.add("displacement", np.c_[:19, 1:20], np.diff(truth, axis=0), std=std)
+    assert abs(solve(problem).x - truth).max() < 1e-6
+
+
 def test_a_slope_that_bends_away_is_followed():
     """From the far side of a ring, where J^T J is a thousand times the curvature, which is negative: FAILED before."""
     problem = Problem([*"ar"], dimension=2, x0=[[0, 0], [10, 0.1]], fixed=(0,)).add("range", (0, 1), 10.0, std=0.1)
@@ -53,7 +62,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
         assert same == pytest.approx(cost, rel=1e-9)
 
 
-def ranged() -> Problem:
+def ranged():
     x0 = np.array([[0.0, 0], [9, 0], [0, 9], [5, 5]])
     problem = Problem([*"abcx"], x0=x0, dimension=2).add("position", list("abc"), x0[:3], 1e-3)
     return problem.add("range", [("x", name) for name in "abc"], norm(x0[:3] - [3.0, 4.0], axis=1), 0.1)

@@ -13,7 +13,7 @@ from coopoc.optimize.backends.gtsam import forms, graph_of, tangent, values, whi
 LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 
 
-def nodes_of(dimension: int) -> Problem:
+def nodes_of(dimension):
     """Three poses and two points somewhere."""
     rng = default_rng(1)
     x = pose(10 * rng.normal(size=(5, dimension)), rng.normal(size=(5, 3)) if dimension == 3 else rng.uniform(-3, 3, 5))
@@ -21,18 +21,18 @@ def nodes_of(dimension: int) -> Problem:
     return Problem(tuple("abcde"), dimension=dimension, poses=range(3), x0=x)
 
 
-def spd(size: int, scale: float = 1.0) -> np.ndarray:
+def spd(size, scale=1.0):
     root = default_rng(2).normal(size=(size, size))
     return scale * (root @ root.T + np.eye(size))
 
 
-def apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def apart(first, second):
     """Covariance of position and rotation that are independent."""
     d, r = len(first), len(second)
     return np.block([[first, np.zeros((d, r))], [np.zeros((r, d)), second]])
 
 
-def measured(dimension: int, kind: str, nodes: list[tuple[str, ...]], noise: dict, loss: Loss | None = None) -> Problem:
+def measured(dimension, kind, nodes, noise, loss=None):
     """One factor of a kind with z anywhere."""
     problem, rng = nodes_of(dimension), default_rng(3)
     count = len(nodes)
@@ -50,7 +50,7 @@ SEEN = [("a", "b"), ("c", "e")]
 BETWEEN = [("a", "b"), ("c", "b")]
 
 
-def natives(d: int) -> dict[str, tuple]:
+def natives(d):
     """What GTSAM must have: kind, nodes, noise, and whether a loss may be on it."""
     turn = spd(1 if d == 2 else 3, 0.01)
     even = np.concatenate([np.full(d, 0.3), np.tile(np.linspace(0.1, 0.4, d), d)])
@@ -86,7 +86,7 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension, name, loss):
         assert_same_objective(measured(dimension, kind, nodes, noise, Loss(loss, scale) if loss else None))
 
 
-def assert_same_objective(problem: Problem):
+def assert_same_objective(problem):
     """Its graph in GTSAM has its cost and gradient."""
     posed, x = which_turn(problem), problem.x0
     at, graph = values(problem.space, posed, x), graph_of(problem, forms(problem))

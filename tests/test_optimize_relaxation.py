@@ -4,7 +4,6 @@ where tight; a local minimum gets no certificate."""
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -19,10 +18,9 @@ from scipy.io import mmread
 from scipy.optimize import least_squares
 from unseen_graphs import World
 
-from coopoc.arrays import Floats
-from coopoc.optimize import Problem, Solution, Status, solve
+from coopoc.optimize import Problem, Status, solve
 from coopoc.optimize.convex import certify, relaxation, shor
-from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
+from coopoc.optimize.convex.qcqp import multipliers, quadratic
 from coopoc.optimize.convex.relaxation import Reduced
 from coopoc.optimize.graph_problems import from_graph, read_graph
 from coopoc.optimize.model.problem import Search
@@ -36,7 +34,7 @@ swarm = partial(tightness.ranged, vehicles=4, mesh=True)
 """Fixes and the ranges of all pairs."""
 
 
-def two_robots(seed: int, d: int = 2, fixed: bool = False, prior: bool = False) -> Problem:
+def two_robots(seed, d=2, fixed=False, prior=False):
     """Odometry of two robots as chordal relative poses and ranges between them; nothing in the world's frame, but a
     prior of the first pose."""
     rng = default_rng(seed)
@@ -47,7 +45,7 @@ def two_robots(seed: int, d: int = 2, fixed: bool = False, prior: bool = False) 
     return problem.add("pose_chordal", 0, problem.x0[0], 0.05) if prior else problem
 
 
-def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
+def brute(problem, starts=30, spread=20.0):
     """Smallest cost that scipy finds from random starts, over positions or, in the plane, positions and headings."""
     rng, n, d = default_rng(0), len(problem.names), problem.dimension
 
@@ -62,7 +60,7 @@ def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
     return min(found() for _ in range(starts))
 
 
-def by_hand(problem: Problem) -> float:
+def by_hand(problem):
     """Shor's relaxation of [1; t; s], no position eliminated, every row of A written out: CVXPY's value."""
     d, n, (fixes, ranges) = problem.dimension, len(problem.names), problem.factors
     m = len(ranges.z)
@@ -86,7 +84,7 @@ def by_hand(problem: Problem) -> float:
     return float(programme.solve(solver=cp.CLARABEL, tol_gap_rel=1e-9, tol_feas=1e-9))
 
 
-def cora(name: str) -> tuple[Quadratic, Problem, Any]:
+def cora(name):
     """One of CORA's unit cases: our QCQP of it and a reader of its expected matrices."""
     folder = measured(f"cora_unit/{name}")
     if name == "single_range":
@@ -96,7 +94,7 @@ def cora(name: str) -> tuple[Quadratic, Problem, Any]:
     return quadratic(problem), problem, lambda matrix: np.asarray(mmread(folder / f"{matrix}.mm").todense())
 
 
-def tangent(form: Quadratic, X: Floats, V: Floats) -> Floats:
+def tangent(form, X, V):
     """The part of V that keeps the constraints to first order."""
     return V - multipliers(form, X, V).matrix @ X
 
@@ -235,7 +233,7 @@ def test_what_has_no_relaxation_is_refused():
         shor(poses.add("relative_position", ("A0", "B0"), [1, 0], [1.0, 2.0]))
 
 
-def minima(problem: Problem, starts: int = 15) -> list[Solution]:
+def minima(problem, starts=15):
     """The minima that Gauss-Newton reaches from random starts, the lowest first."""
     rng, found = default_rng(0), []
     for _ in range(starts):

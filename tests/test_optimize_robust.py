@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -31,7 +30,7 @@ def test_losses_and_weights_are_gtsams(name, scale):
     assert ours.weight(r[1:] ** 2) == pytest.approx(gradient_, rel=1e-4, abs=1e-8)
 
 
-def native(seed: int, wrong: int = 0, loss: Loss | None = None) -> Problem:
+def native(seed, wrong=0, loss=None):
     """Twelve points that GTSAM has factors for: a walk with odometry, three ranges to its start, two fixes of each
     point, of which the first `wrong` second ones are tens of metres off."""
     rng = default_rng(seed)
@@ -48,7 +47,7 @@ def native(seed: int, wrong: int = 0, loss: Loss | None = None) -> Problem:
     return problem.add("position", list(range(12)), fixes[1], std=1.0, loss=loss)
 
 
-def observed(name: str, seed: int) -> Problem:
+def observed(name, seed):
     """Two points among four that are held, by robust measurements of one number each, a third of them wrong."""
     rng = default_rng(seed)
     anchors = np.array([[0, 0, 0], [30, 0, 2], [0, 30, 4], [30, 30, 9.0]])
@@ -99,7 +98,7 @@ def test_the_robust_curvature_is_casadis():
     assert 3 < sum(signs) < len(signs) - 3
 
 
-def gtsams_gnc(problem: Problem, loss: Any) -> tuple[Any, Any]:
+def gtsams_gnc(problem, loss):
     """Graph and GncLMOptimizer at the same probability, all but the second fixes known inliers."""
     graph, params = graph_of(problem, forms(problem)), gtsam.GncLMParams()
     params.setLossType(loss)

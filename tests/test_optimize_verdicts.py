@@ -12,14 +12,13 @@ from numpy.linalg import inv, norm
 from numpy.random import default_rng
 from scipy.optimize import least_squares
 
-from coopoc.arrays import Floats
-from coopoc.optimize import Problem, Solution, Status, solve
+from coopoc.optimize import Problem, Status, solve
 from coopoc.optimize.convex import certify
 from coopoc.optimize.graph_problems import _counted
 from coopoc.optimize.model.problem import Search
 
 
-def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float | Floats) -> Problem:
+def ranged(anchors, start, ranges, std):
     """A robot that ranges anchors in the plane."""
     count = len(anchors)
     problem = Problem((*map(str, range(count)), "r"), x0=np.vstack([anchors, start]), fixed=range(count), dimension=2)
@@ -149,7 +148,7 @@ def test_a_lower_bound_is_below_the_cost(seed):
     assert verdict.lower_bound <= float(least)
 
 
-def held(lower: float) -> Solution:
+def held(lower):
     return solve(Problem([*"a"]).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
 
 

@@ -22,7 +22,7 @@ from .model.measurements import CONVERTED
 from .model.problem import Problem, Search
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
-from .starts.initial import converted, directed, guessed, initial_guess, undirected
+from .starts.initial import converted, directed, guessed, undirected
 from .starts.mirrors import RANGES, RIVAL_COST, scaled
 from .starts.race import (
     ELSEWHERE,
@@ -261,7 +261,7 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
     """(n, ambient), and whether anything places every node in it; InputError if a measurement or a constraint has no
     derivative there."""
     if problem.linear and not problem.constraints:
-        return initial_guess(problem), True
+        return np.zeros((len(problem.names), problem.space.ambient)) if problem.x0 is None else problem.x0, True
     start, placed = guessed(problem)
     lost = undirected(problem, start)
     if lost and problem.x0 is None:
