@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -89,10 +90,7 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> "NoiseModel":
         """The standard deviations of `sensors`, process noise from the measured pace; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        sensors = instance("sensors", sensors, Sensors).check_assumed().assumable()
-        compass = sensors.heading_std, sensors.heading_bias_std
-        sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
-        return cls("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
+        return _nominal(cls, instance("sensors", sensors, Sensors))
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> "NoiseModel":
@@ -238,6 +236,14 @@ def _held_out(make: type[NoiseModel], recording: Recording, fleet: Fleet) -> tup
     if len(change) < 2:
         return 0.0, inf
     return float(change.mean()), float(t.ppf(0.975, len(change) - 1) * change.std(ddof=1) / np.sqrt(len(change)))
+
+
+@lru_cache(maxsize=32)  # to build and to check it takes a quarter of a short drive's time
+def _nominal(make: type[NoiseModel], sensors: Sensors) -> NoiseModel:
+    sensors = sensors.check_assumed().assumable()
+    compass = sensors.heading_std, sensors.heading_bias_std
+    sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
+    return make("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording | None, relative: bool = True) -> NoiseModel:
