@@ -2,21 +2,20 @@
 
 import sys
 import warnings
-from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from numpy import inf, nan
 
-from coopoc import V2X, Fleet, InputError, Links, Recording, Sensors, observe
+from coopoc import V2X, Fleet, InputError, Links, Sensors, observe
 from coopoc.methods.catalogue import METHODS
 
 ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival")
 COLUMNS = ("step", "observer", "neighbour")
 
 
-def drive(steps: int = 12, vehicles: int = 5) -> Fleet:
+def drive(steps=12, vehicles=5):
     """Vehicles that drive side by side and apart; one joins late, one leaves early."""
     t = 0.1 * np.arange(steps)
     velocity = np.tile([8.0, 1.0, 0.0], (steps, vehicles, 1))
@@ -28,7 +27,7 @@ def drive(steps: int = 12, vehicles: int = 5) -> Fleet:
     return Fleet(tuple("abcdefgh"[:vehicles]), t, position, velocity)
 
 
-def recording(runs: int = 4, whole: bool = True) -> Recording:
+def recording(runs=4, whole=True):
     """A valid one; `whole`: every vehicle is there all the time, its channel late and lossy."""
     fleet = drive()
     if whole:
@@ -36,18 +35,18 @@ def recording(runs: int = 4, whole: bool = True) -> Recording:
     return observe(fleet, Sensors.paper_scenario2(), V2X(max_neighbours=3, loss=0.2, latency=0.1), runs=runs, seed=5)
 
 
-def with_parts(valid: Recording, **parts: Any) -> Recording:
+def with_parts(valid, **parts: Any):
     """The recording with other arrays; `step`, `observer` and `neighbour` are those of its links."""
     links = {name: parts.pop(name) for name in COLUMNS if name in parts}
     return replace(valid, **(parts | ({"links": replace(valid.links, **links)} if links else {})))
 
 
-def arrays(valid: Recording) -> dict[str, Any]:
+def arrays(valid):
     """All arrays by name."""
     return {n: getattr(valid, n) for n in ARRAYS} | {n: getattr(valid.links, n) for n in COLUMNS}
 
 
-def wrong(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
+def wrong(valid):
     """Arrays that no recording may have."""
     for name, good in arrays(valid).items():
         for axis in range(good.ndim):
@@ -100,7 +99,7 @@ def wrong(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "more neighbours than K", {"v2x": replace(valid.v2x, max_neighbours=1)}
 
 
-def rearranged(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
+def rearranged(valid):
     """The same numbers in other memory."""
     same = arrays(valid)
 
@@ -131,7 +130,7 @@ def rearranged(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "unsigned links", {name: same[name].astype(np.uint64) for name in COLUMNS}
 
 
-def allowed(valid: Recording, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any]]]:
+def allowed(valid, rng):
     """Odd recordings that hold nothing wrong: every method answers or says why it cannot."""
     links, runs = len(valid.links), valid.runs
     far, lost = valid.links.step + rng.integers(0, 40, (runs, links)), np.full((runs, links), -1)
@@ -151,7 +150,7 @@ def allowed(valid: Recording, rng: np.random.Generator) -> Iterator[tuple[str, d
     yield "far away", {"gnss": valid.gnss + 1e7}
 
 
-def answers(valid: Recording, only: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+def answers(valid, only=()):
     """(method, what it answers): positions, or the exception."""
     for name, make in METHODS.items():
         if not only or name in only:
@@ -161,7 +160,7 @@ def answers(valid: Recording, only: tuple[str, ...] = ()) -> Iterator[tuple[str,
                 yield name, error
 
 
-def complaints(only: tuple[str, ...] = (), odd: bool = True) -> Iterator[str]:
+def complaints(only=(), odd=True):
     """What is not as it should be, line by line."""
     for whole in (True, False):
         valid = recording(whole=whole)

@@ -1,13 +1,9 @@
 """PyFG and g2o files of a graph, written from the definitions of the formats: what the readers must give back."""
 
-from pathlib import Path
-
 import numpy as np
 
-from coopoc.formats.graph import Graph
 
-
-def write_graph(graph: Graph, path: Path):
+def write_graph(graph, path):
     """Write a .pyfg file with stamps and covariances, or a .g2o file with GTSAM's symbol keys and information."""
     pyfg, d = path.suffix == ".pyfg", graph.dimension
     pose, point = f"SE{d}{':QUAT' if d == 3 else ''}", "XY" if d == 2 else "XYZ" if pyfg else "TRACKXYZ"

@@ -2,13 +2,12 @@
 
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 from shell import ran
 
 
-def compiled(tables: str, folder: Path) -> str:
+def compiled(tables, folder):
     """What pdflatex says about a page with these tables; t.pdf is in the folder."""
     if shutil.which("pdflatex") is None:
         pytest.skip("pdflatex is not installed: apt-get install texlive-latex-base texlive-latex-recommended")

@@ -1,17 +1,16 @@
 """Logs written from simulated recordings, for tests of what reads them."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.random import Generator, default_rng
+from numpy.random import default_rng
 
-from coopoc import V2X, Fleet, Recording, Sensors, observe
+from coopoc import V2X, Fleet, Sensors, observe
 
 
-def drive(vehicles: int = 4, steps: int = 200, dt: float = 0.1, start: float = 0.0, gap: float = 8.0) -> Fleet:
+def drive(vehicles=4, steps=200, dt=0.1, start=0.0, gap=8.0):
     """Vehicles side by side on a wide bend at 8 m/s, `gap` metres apart."""
     t = dt * np.arange(steps)
     course = 0.4 * np.sin(0.15 * t)
@@ -26,14 +25,14 @@ def drive(vehicles: int = 4, steps: int = 200, dt: float = 0.1, start: float = 0
 NOISE = Sensors(gnss_std=(1.5, 1.5, 0.5), velocity_std_ratio=0.0, velocity_floor=0.1, range_std=0.3, min_range=0.0)
 
 
-def observed(fleet: Fleet, k: int = 3, **channel: Any) -> Recording:
+def observed(fleet, k=3, **channel: Any):
     """One run of noisy measurements, with noise on the velocity as wide as its floor."""
     recording = observe(fleet, NOISE, V2X(k, 120.0, **channel), seed=3)
     noise = default_rng(0).normal(0, 0.1, recording.velocity.shape) * [1, 1, 0]
     return replace(recording, velocity=recording.velocity + noise)
 
 
-def long(recording: Recording, messages: bool = True) -> pd.DataFrame:
+def long(recording, messages=True):
     """One row per number that a recording holds."""
     rows: list[dict[str, Any]] = []
     ids, t = recording.ids, recording.t
@@ -60,25 +59,25 @@ def long(recording: Recording, messages: bool = True) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def write(frame: pd.DataFrame, path: Path) -> Path:
+def write(frame, path):
     """A table as CSV or Parquet."""
     getattr(frame, f"to_{path.suffix[1:]}")(path, index=False)
     return path
 
 
-def at(fleet: Fleet, name: str, t: Any) -> Any:
+def at(fleet, name, t):
     """(M, 3) m, where a vehicle is at times between the steps."""
     return np.column_stack([np.interp(t, fleet.t, axis) for axis in fleet.position[:, fleet.ids.index(name)].T])
 
 
-def fixes(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
+def fixes(fleet, name, every, std, seed=0):
     """Fixes x, y, z of one vehicle, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     x = at(fleet, name, t) + default_rng(seed).normal(0, std, (len(t), 3))
     return pd.DataFrame({"t": t, "vehicle": name, **dict(zip("xyz", x.T, strict=True)), "x_std": std, "y_std": std})
 
 
-def motion(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
+def motion(fleet, name, every, std, seed=0):
     """World velocities vx, vy, vz of one vehicle, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     u = (at(fleet, name, t + 0.05) - at(fleet, name, t - 0.05)) / 0.1
@@ -86,14 +85,14 @@ def motion(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> 
     return pd.DataFrame({"t": t, "vehicle": name, "vx_std": std, **dict(zip(("vx", "vy", "vz"), u.T, strict=True))})
 
 
-def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
+def ranges(fleet, name, other, every, std, seed=0):
     """Ranges of one vehicle to another, in a wide table."""
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     gap = np.linalg.norm(at(fleet, other, t) - at(fleet, name, t), axis=1)
     return noisy(default_rng(seed), t, name, {"range": (gap, std)}).assign(partner=other)
 
 
-def noisy(rng: Generator, t: Any, name: str, columns: dict[str, tuple[Any, float]]) -> pd.DataFrame:
+def noisy(rng, t, name, columns):
     """What one vehicle measures, in a wide table: kind -> (truth, std)."""
     measured = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
     return pd.DataFrame(
@@ -101,14 +100,14 @@ def noisy(rng: Generator, t: Any, name: str, columns: dict[str, tuple[Any, float
     )
 
 
-def star(t: Any, rng: Any, name: str, ways: Any, velocity: Any, seen: Any) -> pd.DataFrame:
+def star(t, rng, name, ways, velocity, seen):
     """Velocities, fixes and ranges to all others of one of those on complex `ways`, in a wide table."""
     columns = {"vx": (velocity.real, 0.1), "vy": (velocity.imag, 0.1), "x": (seen.real, 1.3), "y": (seen.imag, 1.3)}
     reach = {f"range_{other}": (abs(way - ways[name]), 0.1) for other, way in ways.items() if other != name}
     return noisy(rng, t, name, columns | reach)
 
 
-def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
+def bends(vehicles=2, minutes=3.0, climb=0.0):
     """Vehicles on bends through all directions at 8 m/s, 12 m apart; `climb` m of height that come and go."""
     t = 0.02 * np.arange(int(minutes * 3000))
     course = 2.5 * np.sin(0.1 * t)
@@ -118,7 +117,7 @@ def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
     return Fleet(tuple(f"car{k}" for k in range(vehicles)), t, position, np.repeat(velocity[:, None], vehicles, 1))
 
 
-def outliers(values: Any, share: float = 0.05) -> Any:
+def outliers(values, share=0.05):
     """Ranges of which a share is 3 to 10 m too long, as by reflections."""
     rng = default_rng(9)
     return values + np.where(rng.random(len(values)) < share, rng.uniform(3, 10, len(values)), 0.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 
 
-def lower(requirement: str) -> str:
+def lower(requirement):
     """The constraint of a requirement.
 
     >>> lower("scipy>=1.13"), lower("numba>=0.68,<0.69"), lower("numpy>=2")

@@ -23,7 +23,7 @@ for package, folder in [*PROJECT["tool"]["setuptools"]["package-dir"].items(), *
 
 
 @cache
-def nodes(module: str) -> tuple[ast.AST, ...]:
+def nodes(module):
     """Of a module's text, or of the stub beside it, without imports for types alone."""
     stub = FILES[module].with_suffix(".pyi")
     tree = ast.parse((stub if stub.exists() else FILES[module]).read_bytes())
@@ -34,7 +34,7 @@ def nodes(module: str) -> tuple[ast.AST, ...]:
 
 
 @cache
-def names(module: str) -> dict[str, tuple[str, str]]:
+def names(module):
     """What each imported name is: a module, and a name there or none."""
     found: dict[str, tuple[str, str]] = {}
     package = module if FILES[module].stem == "__init__" else module.rpartition(".")[0]
@@ -47,7 +47,7 @@ def names(module: str) -> dict[str, tuple[str, str]]:
     return found
 
 
-def home(module: str, name: str) -> str:
+def home(module, name):
     """Module that defines a name of a module."""
     if f"{module}.{name}" in FILES:
         return f"{module}.{name}"
@@ -56,7 +56,7 @@ def home(module: str, name: str) -> str:
 
 
 @cache
-def uses(module: str) -> frozenset[str]:
+def uses(module):
     """Modules of the project that a module needs."""
     known, plugins = names(module), PLUGINS if FILES[module].is_relative_to(ROOT / "tests") else {}
     found = {home(*target) for target in known.values()}
@@ -68,7 +68,7 @@ def uses(module: str) -> frozenset[str]:
     return frozenset(found & FILES.keys() - {module, "coopoc"})  # `import coopoc` loads nothing
 
 
-def distance(test: str, goal: set[str]) -> tuple[int, int]:
+def distance(test, goal):
     """Imports from a test to the nearest of some modules, and how many modules are as near; 0 if none is reached."""
     ring, seen, steps = {test}, {test}, 0
     while ring and goal.isdisjoint(ring):

@@ -5,7 +5,6 @@ python tests/oracle_page.py        # writes the page; tests/test_reliability.py 
 
 import ast
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 TESTS, PAGE = Path(__file__).parent, Path(__file__).resolve().parents[1] / "docs" / "oracles.md"
@@ -42,7 +41,7 @@ the README's table without the toolkit. `python tests/oracle_page.py` writes thi
 """
 
 
-def rows() -> Iterator[tuple[str, str]]:
+def rows():
     """File and tests, with reference and tolerances, of every file with an independent reference."""
     for file in sorted(TESTS.glob("test_*.py")):
         text, tests = file.read_text(), []
@@ -57,7 +56,7 @@ def rows() -> Iterator[tuple[str, str]]:
             yield file.stem, "; ".join(tests)
 
 
-def page() -> str:
+def page():
     """The whole page."""
     lines = ["| file | tests, with reference and tolerances |", "|---|---|"]
     return HEAD + "\n".join([*lines, *(f"| `{file}` | {tests} |" for file, tests in rows())]) + "\n"

@@ -7,50 +7,50 @@ import numpy as np
 from scipy.optimize import least_squares
 from unseen_graphs import joined, world
 
-from coopoc.formats.graph import Graph, PointEdges, RangeEdges
-from coopoc.optimize import Loss, Problem
+from coopoc.formats.graph import PointEdges, RangeEdges
+from coopoc.optimize import Problem
 
 AB = "a", "b"
 PAIR = Problem(AB).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 """Two points with fixes."""
 
 
-def torn(loss: Loss | None = None) -> Problem:
+def torn(loss=None):
     """A point that two displacements from a held one place 140 m apart."""
     held = Problem([*"oa"], x0=np.eye(2, 3), fixed=(0,))
     return held.add("displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0, loss=loss)
 
 
-def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+def moved(problem, x, v):
     """x after a step of the numbers that can move; in the plane a derivative there is one by v."""
     step = np.zeros(problem.movable.shape)
     step[problem.movable] = v
     return problem.space.retract(x, step)
 
 
-def scipys(problem: Problem, start: np.ndarray, **options: Any) -> Any:
+def scipys(problem, start, **options: Any):
     """SciPy's least squares over the numbers that can move, from nodes (n, ambient), with our derivatives."""
     free = np.flatnonzero(problem.movable)
 
-    def at(v: np.ndarray) -> Any:
+    def at(v):
         return problem.whiten(moved(problem, start, v))
 
     return least_squares(lambda v: at(v)[0], np.zeros(len(free)), lambda v: at(v)[1][:, free].toarray(), **options)
 
 
 def random_graph(
-    seed: int,
-    dimension: int = 2,
-    robots: int = 2,
-    steps: int = 60,
-    landmarks: int = 6,
-    loops: int = 10,
-    ranges: int = 80,
-    seen: int = 40,
-    turn_std: float = 0.01,
-    step_std: float = 0.05,
-    priors: bool = False,
-) -> Graph:
+    seed,
+    dimension=2,
+    robots=2,
+    steps=60,
+    landmarks=6,
+    loops=10,
+    ranges=80,
+    seen=40,
+    turn_std=0.01,
+    step_std=0.05,
+    priors=False,
+):
     """Robots A, B, ... of `steps` poses 1 m apart within 40 m, whose vertices hold the truth.
 
     Args:
@@ -76,7 +76,7 @@ random_drive = partial(random_graph, robots=1, landmarks=0, ranges=0)
 """Odometry and loops of one robot."""
 
 
-def star(kind: str, seed: int, neighbours: int = 6, fix_std: float = 2.0, height: float = 0.2) -> Problem:
+def star(kind, seed, neighbours=6, fix_std=2.0, height=0.2):
     """An ego with ranges to, or azimuths of, its neighbours, and fixes."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (neighbours, 3)) * [1, 1, height]])

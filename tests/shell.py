@@ -9,12 +9,12 @@ ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 
 
-def ran(command: Any, **more: Any) -> subprocess.CompletedProcess[str]:
+def ran(command, **more: Any):
     """What a command printed and returned; options as of `subprocess.run`."""
     return subprocess.run(command, capture_output=True, text=True, **more)
 
 
-def python(*words: Any, **more: Any) -> str:
+def python(*words, **more: Any):
     """What Python printed with these words; fails with its complaint."""
     done = ran([sys.executable, *words], **more)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr

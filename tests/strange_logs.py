@@ -1,6 +1,5 @@
 """Logs of drones, cars and robots with a truth, clean or with faults that are planted in them."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ KINDS: dict[str, tuple[int, float, float, float, float, float, tuple[float, ...]
 """Vehicles, m/s, m apart, m of climb, standard deviations m of fixes and ranges, Hz of fixes, odometry and ranges."""
 
 
-def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate: float = 1.0, **fault: Any) -> Path:
+def strange(folder, kind, seed=0, seconds=180.0, rate=1.0, **fault: Any):
     """A log and its truth: drones that range each other, cars with a radar to the one ahead, robots with an anchor.
 
     Args:

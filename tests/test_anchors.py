@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopoc import GNSS, LKFSA, V2X, Fleet, Kalman, Links, NoiseModel, Sensors, observe
+from coopoc import GNSS, LKFSA, V2X, Kalman, Links, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import max_error, rt_le
-from coopoc.world.recording import Recording
 
 SENSORS = Sensors(gnss_std=(3.5, 3.5, 3.5))
 
 
-def fixture(fleet: Fleet, neighbours: int, ratio: float = 1.0, sensors: Sensors = SENSORS) -> Recording:
+def fixture(fleet, neighbours, ratio=1.0, sensors=SENSORS):
     """Constant process noise, diag(.0707, .0707, .001) m per step, and a start from the fixes alone."""
     recording = observe(fleet, sensors, V2X(max_neighbours=neighbours), runs=40, observers=[0])
     links, late = recording.links, recording.links.step > 0
@@ -26,7 +25,7 @@ def fixture(fleet: Fleet, neighbours: int, ratio: float = 1.0, sensors: Sensors 
     return replace(recording, velocity=fleet.velocity + noise * [ratio, ratio, 1.0])
 
 
-def score(method, recording: Recording, fleet: Fleet) -> float:
+def score(method, recording, fleet):
     """Mean RT-LE over runs from step 1 on: the anchors start at a fix that is not scored."""
     track = method(recording, [0])
     return float(
@@ -34,7 +33,7 @@ def score(method, recording: Recording, fleet: Fleet) -> float:
     )
 
 
-def tuned(ratio: float = 1.0, gnss: float = 3.5) -> NoiseModel:
+def tuned(ratio=1.0, gnss=3.5):
     return NoiseModel("fitted", SENSORS, process_std=(0.0707 * ratio, 0.0707 * ratio, 0.001), gnss_std=(gnss,) * 3)
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from conftest import coming_and_going, half_width, refused, standing, textbook, 
 from oracles.batch_smoother import batch_smoother
 from scipy.optimize import least_squares
 
-from coopoc import V2X, BatchSmoother, Fleet, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, BatchSmoother, NoiseModel, Sensors, observe
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import nees, rt_le, share_of_average
 from coopoc.methods.batch_smoother import CENTRE, NOT_CAUSAL
@@ -29,7 +28,7 @@ CHANNELS = {
 }
 
 
-def holed(recording: Recording, fixes: float, angles: float, delays: int = 0) -> Recording:
+def holed(recording, fixes, angles, delays=0):
     """Without shares of the fixes and of ranges and angles; messages up to so many steps later than sent."""
     rng = np.random.default_rng(4)
     gnss, relative, arrival = recording.gnss.copy(), recording.relative.copy(), recording.arrival.copy()
@@ -41,7 +40,7 @@ def holed(recording: Recording, fixes: float, angles: float, delays: int = 0) ->
     return replace(recording, gnss=gnss, relative=relative, arrival=arrival)
 
 
-def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absences: bool = True) -> Recording:
+def drive(crossing, channel, runs=1, gaps=True, absences=True):
     fleet = crossing.select(range(6)).between(0, 14)
     if absences:
         fleet = without(fleet, (slice(4, 9), 1), (slice(6), 2), (slice(9, 14), 3))
@@ -49,7 +48,7 @@ def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absen
     return holed(recording, 0.5, 0.2, 3 if channel == "lossy and late" else 0) if gaps else recording
 
 
-def compare(known: str, recording: Recording):
+def compare(known, recording):
     """Positions and covariances of all vehicles that are there throughout, in every run."""
     model = KNOWN[known]
     noise = resolve(model, recording)
@@ -65,7 +64,7 @@ def compare(known: str, recording: Recording):
             ).max() < 1e-6
 
 
-def held(gnss: Any) -> Any:
+def held(gnss):
     """Each vehicle's last fix, its first one before that."""
     t = np.maximum.accumulate(np.where(np.isfinite(gnss[..., 0]), np.arange(len(gnss))[:, None], -1))
     return gnss[np.where(t < 0, np.isfinite(gnss[..., 0]).argmax(0), t), np.arange(gnss.shape[1])]
@@ -116,7 +115,7 @@ def test_absent_egos_and_observers_are_named(crossing):
         Message("x", numbers=-1)
 
 
-def problem(recording: Recording, known: NoiseModel) -> Any:
+def problem(recording, known):
     """Whitened residuals of run 0 as a function of all positions, written down term by term."""
     steps, vehicles = recording.gnss.shape[1:3]
     motion_std = np.sqrt(np.broadcast_to(known.process_variance(recording), recording.gnss.shape)[0, 1:])

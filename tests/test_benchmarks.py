@@ -8,7 +8,6 @@ import sys
 from dataclasses import replace
 from pkgutil import resolve_name
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
 BASELINE = {"a: ours": {"ratio": 1.0, "tolerance": 1.5}, "b: ours": {"ratio": 0.01, "tolerance": 2.0}}
 
 
-def row(name: str, ratio: float, right: bool | None = True) -> dict[str, Any]:
+def row(name, ratio, right=True):
     return {"name": name, "us": 7.0, "ratio": ratio, "right": right}
 
 

@@ -1,7 +1,6 @@
 """Posterior Cramer-Rao bounds against GTSAM's marginals, closed forms, and the filters that they bound."""
 
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -43,13 +42,11 @@ def test_solo_bound_tends_to_the_riccati_solution():
     )
 
 
-def node(vehicle: int, step: int) -> int:
+def node(vehicle, step):
     return int(gtsam.symbol(chr(97 + vehicle), step))
 
 
-def point_marginals(
-    fleet: Fleet, steps: int, v2x: V2X, observers: Any, seen: co.Recording | None = None
-) -> gtsam.Marginals:
+def point_marginals(fleet, steps, v2x, observers, seen=None):
     """Fixes, motions and converted measurements of observers and those they measure, at the truth, as GTSAM factors.
 
     What a recording lacks in its first run has no factor, or, of one component, a standard deviation of UNSEEN.
@@ -164,11 +161,11 @@ def test_exact_fixes_have_no_bound(crossing):
         posterior_bound(crossing, Sensors(gnss_std=(0, 1, 1)), 0)
 
 
-def sigmas(*std: float) -> Any:
+def sigmas(*std):
     return gtsam.noiseModel.Diagonal.Sigmas(np.array(std))
 
 
-def pose_marginals(fleet: co.Fleet, steps: int, sensors: co.Sensors) -> Any:
+def pose_marginals(fleet, steps, sensors):
     """Fixes, compasses, odometry, bearings and ranges in the plane at the truth, as GTSAM's own factors."""
     marks = [k for k, name in enumerate(fleet.ids) if name[0] == "m"]
     links = find_links(fleet, range(len(fleet.ids)), NEAR, sensors.min_range, marks)

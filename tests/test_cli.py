@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from shell import python, ran
@@ -18,7 +17,7 @@ from coopoc.cli import main
 COMMAND = [sys.executable, "-m", "coopoc.cli"]
 
 
-def coopoc(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
+def coopoc(*words, cwd):
     return ran([*COMMAND, *" ".join(words).split()], cwd=cwd, env=ENV, timeout=120)
 
 

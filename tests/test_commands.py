@@ -31,7 +31,7 @@ FETCHED = {"mrclam-set6": "MRCLAM_Dataset6", "tiers": "tiers.pyfg"}
 """Data that the repository does not hold, and what they open."""
 
 
-def commands(path: Path) -> list[str]:
+def commands(path):
     """Lines of commands and commands between backquotes, without their comments."""
     text = path.read_text().replace("\\\n", " ")
     lines = re.findall(r"^(?:# )? *(coopoc [^\n`]*)$", text, flags=re.MULTILINE)
@@ -43,13 +43,13 @@ INSTALLED = "coopoc run side_by_side --data ring --set method=alpha,joint runs=2
 COMMANDS = sorted({(path.name, line) for path in PAGES for line in commands(path)} - {("extend.md", INSTALLED)})
 
 
-def words(line: str) -> list[str]:
+def words(line):
     for word, chosen in WORDS.items():
         line = re.sub(rf"(?<![\w.:]){re.escape(word)}(?!\w)", chosen, line)
     return shlex.split(line, comments=True)[1:]
 
 
-def parsed(argv: list[str]) -> tuple[str, dict[str, Any]]:
+def parsed(argv):
     """The command of the words, and the arguments that tyro makes of the rest; nothing is called."""
     known: Mapping[str, Any] = {**plugins.points("coopoc.commands"), **OWN_COMMANDS}
     names = []

@@ -1,10 +1,9 @@
 """The cooperative filter: equal to the joint filter with everything off, and best of all where numbers are wrong."""
 
 import pickle
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial as partial_of
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, partial
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Method, Recording, Sensors, Track, load_fleet, nees, observe, rt_le
+from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import errors
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
@@ -32,12 +31,12 @@ S2 = Sensors.paper_scenario2()
 EITHER = pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
 
 
-def drive(steps: int = 80) -> Fleet:
+def drive(steps=80):
     """The start of a drive in dense traffic."""
     return load_fleet("town10-validation").between(0, steps)
 
 
-def every(fleet: Fleet, step: int) -> Fleet:
+def every(fleet, step):
     """A drive in longer steps."""
     return Fleet(fleet.ids, fleet.t[::step], fleet.position[::step], fleet.velocity[::step])
 
@@ -55,7 +54,7 @@ def test_with_everything_off_it_is_the_joint_filter(change):
     assert_allclose(ours.covariance[:, 1:], joint.covariance[:, 1:], rtol=2e-3, atol=1e-8)
 
 
-def assert_is_the_oracle(track: Track, seen: Recording, priors: Priors = Priors()):
+def assert_is_the_oracle(track, seen, priors=Priors()):
     """Of ego 0, in every run."""
     for run in range(seen.runs):
         x, cov, others = Oracle(seen, 0, run, resolve("nominal", seen), priors).loop()
@@ -65,12 +64,12 @@ def assert_is_the_oracle(track: Track, seen: Recording, priors: Priors = Priors(
             assert_allclose(track.neighbours[run][-len(np.concatenate(others)) :], np.concatenate(others), atol=2e-6)
 
 
-def mean_errors(seen: Recording, fleet: Fleet, egos: Sequence[int], *others: Method) -> list[float]:
+def mean_errors(seen, fleet, egos, *others):
     """Of the cooperative filter and of others, m."""
     return [float(rt_le(method(seen, egos), fleet).mean()) for method in (CooperativeFilter(), *others)]
 
 
-def too_long(seen: Recording, share: float = 0.05) -> Recording:
+def too_long(seen, share=0.05):
     """Ranges as behind a corner."""
     rng, relative = default_rng(1), np.array(seen.relative)
     hit = rng.random(relative.shape[:2]) < share
@@ -78,14 +77,14 @@ def too_long(seen: Recording, share: float = 0.05) -> Recording:
     return replace(seen, relative=relative)
 
 
-def moved(seen: Recording, when: Any, column: int, by: Any) -> Recording:
+def moved(seen, when, column, by):
     """Fixes of a vehicle at some steps are off."""
     gnss = seen.gnss.copy()
     gnss[:, when, column] += by
     return replace(seen, gnss=gnss)
 
 
-def displaced(seen: Recording) -> Recording:
+def displaced(seen):
     """For some steps the ego's fixes are 50 m off: it follows them, and goes back."""
     return moved(seen, slice(15, 45), 0, [40.0, 30.0, 0.0])
 
@@ -375,20 +374,20 @@ def test_a_lost_message_costs_no_more_than_the_message():
     assert max(spread) < 1.1 * spread[0]
 
 
-def mirrored(recording: Recording) -> Recording:
+def mirrored(recording):
     """Ranges in another unit, azimuths of another sign; a fix of the ego each second."""
     seldom = moved(recording, np.arange(len(recording.t)) % 10 > 0, 0, nan)
     return replace(seldom, relative=recording.relative * [2.0, -1.0, 1.0])
 
 
-def failing(recording: Recording) -> Recording:
+def failing(recording):
     """The odometers of the ego and of a neighbour lead backwards after a while."""
     velocity = recording.velocity.copy()
     velocity[:, 15:, :2] *= -1.0
     return replace(recording, velocity=velocity)
 
 
-def tunnel(recording: Recording) -> Recording:
+def tunnel(recording):
     """At first no vehicle has a fix, then for a while all but the ego."""
     gnss = recording.gnss.copy()
     gnss[:, :3] = gnss[:, :25, 0] = nan
@@ -468,7 +467,7 @@ def test_step_by_step_it_is_the_track(crossing, case):
     assert trusted == ({True} if case == "lost" else {True, False})
 
 
-def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int, j: int) -> dict[str, Any]:
+def newest(seen, sent, t, s, j):
     """The newest broadcast that is held, as a stream takes it."""
     if s < 0 or sent[j, s] is None:
         return {}

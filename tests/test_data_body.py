@@ -3,7 +3,6 @@
 import re
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,11 +28,11 @@ MAST = (25.0, 3.0)
 STD = {"speed": 0.05, "yaw_rate": 0.01, "x": 0.5, "y": 0.5, "range": 0.1, "bearing": 0.03, "heading": 0.05}
 
 
-def wrapped(angle: Any) -> Any:
+def wrapped(angle):
     return np.mod(np.asarray(angle) + pi, 2 * pi) - pi
 
 
-def drives() -> dict[str, tuple[Any, Any, float, float]]:
+def drives():
     """Places (T, 2) m, headings (T,) rad, speed and yaw rate of cars on circles: all closed forms."""
     out = {}
     for name, (start, radius, rate) in CARS.items():
@@ -42,7 +41,7 @@ def drives() -> dict[str, tuple[Any, Any, float, float]]:
     return out
 
 
-def table(noise: float = 0.0, mirrored: bool = False, compass: bool = True) -> tuple[pd.DataFrame, pd.DataFrame]:
+def table(noise=0.0, mirrored=False, compass=True):
     """A log and its truth; the mast measures ranges."""
     rng, rows, truth, cars = np.random.default_rng(5), [], [], drives()
 
@@ -72,7 +71,7 @@ def table(noise: float = 0.0, mirrored: bool = False, compass: bool = True) -> t
     return log, pd.DataFrame(truth, columns=["t", "vehicle", "x", "y", "heading"])
 
 
-def written(folder: Path, **options: Any) -> Path:
+def written(folder, **options: Any):
     log, truth = table(**options)
     folder.mkdir(exist_ok=True)
     log.to_csv(folder / "log.csv", index=False)
@@ -272,7 +271,7 @@ def test_studies_say_where_a_log_belongs(tmp_path):
         co.run_study("real", tmp_path, settings={"data": str(folder)}, progress=False)
 
 
-def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:
+def librsf(folder, wheels):
     """A robot on a circle of 5 m ranges four anchors without error, as libRSF writes it; its true way and headings."""
     t = np.arange(0, 40, 0.1)
     angle = 0.15 * t

@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from itertools import permutations
-from pathlib import Path
 from time import process_time
 from typing import Any
 
@@ -20,15 +19,15 @@ from strange_logs import strange
 import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.estimates import factors
-from coopoc.data.log.read import Log, read_log
+from coopoc.data.log.read import read_log
 from coopoc.data.registry import read_log as load_log
 
 
-def said(log: Log) -> str:
+def said(log):
     return "\n".join(check(log).warnings)
 
 
-def cars(folder: Path, change: Any = lambda frame: frame, rate: float = 0.1) -> Path:
+def cars(folder, change=lambda frame: frame, rate=0.1):
     """Two cars on a plane: fixes twice a second, odometry, ranges five times a second by the first alone."""
     fleet = bends()
     parts = [ranges(fleet, "car0", "car1", 0.2, 0.3)]
@@ -308,7 +307,7 @@ def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
         assert ("reference point, of car (1.5, 0.5, 0 m forward, left, up, by" in " ".join(rec.notes)) == bool(option)
 
 
-def turned_drive(folder: Path, speed: Any, turn: float, seconds: float = 120.0) -> Path:
+def turned_drive(folder, speed, turn, seconds=120.0):
     """A car that goes round in circles or stops, fixes of 1 m once a second, headings turned by an angle."""
     folder.mkdir(exist_ok=True)
     rng, t = default_rng(1), np.arange(0, seconds, 0.04)

@@ -1,7 +1,6 @@
 """What `coopoc data check` names in logs with several faults at once, and that it names nothing in clean ones."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ CONVOY: dict[str, Any] = {"wheels": {"car2": 0.03}, "tunnel": (60, 100), "pairs"
 ROBOTS: dict[str, Any] = {"wheels": {"robot0": 0.03, "robot1": 0.03}, "unit": 1e-3}
 
 
-def said(folder: Path, options: str = "") -> str:
+def said(folder, options=""):
     return "\n".join(check(load_log(f"{folder}?{options}" if options else str(folder))).warnings)
 
 

@@ -85,7 +85,7 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-def entry(name: str, files: dict[str, bytes], address: str = "", **more: str) -> Entry:
+def entry(name, files, address="", **more: str):
     rows = {f: (f"{address}/{f}", len(data), hashlib.sha256(data).hexdigest()) for f, data in files.items()}
     return Entry(name, "a car", "MIT", "An author, 2026", "https://example.org/page", "not tried", rows, **more)
 

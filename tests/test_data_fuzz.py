@@ -13,7 +13,7 @@ from fuzz.tokens import TOKENS
 CORPUS = Path(__file__).parent / "fuzz" / "corpus"
 
 
-def mutated(text: str, rng: np.random.Generator) -> bytes:
+def mutated(text, rng):
     """One to four changes: a token or a byte replaced, a line repeated, moved or cut, the end torn off."""
     draw = rng.integers
     data = text

@@ -1,7 +1,6 @@
 """Logs of one's own: what is read is what was measured, whatever the units, rates, clocks and gaps."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -237,18 +236,18 @@ LATE = 0.04
 MAST = np.array([40.0, 60.0])
 
 
-def straight(t: Any) -> dict[str, Any]:
+def straight(t):
     """Two cars that pass each other at 25 m/s."""
     here = np.asarray(t, float)
     return {"east": np.array([15 * here - 100, 0 * here]), "west": np.array([60 - 10 * here, 4 + 0 * here])}
 
 
-def circle(t: float) -> tuple[Any, float]:
+def circle(t):
     """Place m and heading rad of a car at 6 m/s that turns by 0.5 rad/s."""
     return np.array([12 * np.sin(0.5 * t), -12 * np.cos(0.5 * t)]), 0.5 * t
 
 
-def read_rows(rows: list[tuple[Any, ...]], folder: Path, **options: Any) -> co.Recording:
+def read_rows(rows, folder, **options: Any):
     file = folder / "log.csv"
     pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value"]).to_csv(file)
     return co.read_log(file, **options).recording

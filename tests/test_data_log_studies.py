@@ -30,7 +30,7 @@ from coopoc.world.storage import digest, read_recording, save_recording
 FEW = {"method": "gnss,kalman,joint,bound", "max_neighbours": "0,2"}
 
 
-def truth(fleet: co.Fleet) -> pd.DataFrame:
+def truth(fleet):
     frame = pd.DataFrame(fleet.position.reshape(-1, 3), columns=[*"xyz"])
     return frame.assign(t=np.repeat(fleet.t, len(fleet.ids)), vehicle=fleet.ids * len(fleet.t))
 

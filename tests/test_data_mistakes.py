@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,12 +31,12 @@ STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.8\n" for k in ran
 RANGES = "t,vehicle,partner,range\n0,tag,anchor,4.2\n1,tag,anchor,4.4\n"
 
 
-def swap(old: str, new: str, text: str = GOOD) -> str:
+def swap(old, new, text=GOOD):
     assert old in text
     return text.replace(old, new, 1)
 
 
-def nanoseconds(text: str) -> str:
+def nanoseconds(text):
     return re.sub(r"(?m)^([\d.]+),", lambda m: f"{1_700_000_000_000_000_000 + int(float(m[1]) * 1e9)},", text)
 
 
@@ -200,7 +199,7 @@ def test_what_does_not_fit_is_counted_with_its_place(tmp_path, case):
     assert place.startswith("log.csv: row ")
 
 
-def same(a: co.Recording, b: co.Recording) -> bool:
+def same(a, b):
     """Whether two recordings hold the same numbers."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("t", "gnss", "velocity", "relative", "arrival"))
     return a.ids == b.ids and all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
@@ -226,7 +225,7 @@ def test_seconds_and_nanoseconds_of_a_stamp_are_one_time(tmp_path, option, time)
     assert same(co.read_log(tmp_path / "a.csv").recording, load_log(f"{tmp_path / 'b.csv'}{option}").recording)
 
 
-def parts(folder: Path) -> Path:
+def parts(folder):
     """The good log in two tables whose headers differ, and its truth."""
     folder.mkdir()
     head, *rows = GOOD.splitlines()

@@ -2,9 +2,7 @@
 constant velocity with the density that is best by the truth, and filters that are told what a log does not hold."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,7 +19,6 @@ from scipy.spatial.transform import Rotation
 import coopoc as co
 from coopoc.arrays import Floats
 from coopoc.data.log.check import check
-from coopoc.data.log.read import Log
 from coopoc.kernels.constant_velocity import BANK, constant_velocity
 from coopoc.world.body_frames import in_world, turned
 from coopoc.world.links import wrap
@@ -35,7 +32,7 @@ SPEED, COURSE = 8 + 6 * np.sin(T / 17), np.cumsum(0.1 * 0.25 * np.sin(T / 9) * n
 RATE = np.gradient(COURSE, 0.1)
 
 
-def path(name: str) -> Floats:
+def path(name):
     """(T, 3) m: a car that stops, goes and turns; a drone; a slow robot."""
     if name == "drone":
         return np.c_[3 * np.sin(T / 2.5), 3 * np.sin(T / 1.7 + 1), 1 + 0.5 * np.sin(T / 4)]
@@ -47,14 +44,12 @@ def path(name: str) -> Floats:
     return np.cumsum(0.1 * SPEED[:, None] * np.c_[np.cos(COURSE), np.sin(COURSE), climb], axis=0)
 
 
-def axes(u: Floats, frame: str = "") -> dict[str, Floats]:
+def axes(u, frame=""):
     """Columns of a velocity (T, 3) m/s."""
     return {f"v{axis}{frame}": u[:, c] for c, axis in enumerate("xyz")}
 
 
-def log(
-    folder: Path, name: str, std: float | Floats, every: int, seed: int = 0, steps: Sequence[int] = (), **more: Floats
-) -> tuple[Log, Floats, Floats]:
+def log(folder, name, std, every, seed=0, steps=(), **more: Floats):
     """A log of noisy fixes at some of the steps, and of what else is measured at all of them; times and fixes."""
     x, rng = path(name), default_rng(seed)
     k = np.array(steps) if len(steps) else np.arange(0, len(T), every)
@@ -68,12 +63,12 @@ def log(
     return co.read_log(folder), T[k], z[k]
 
 
-def error(read: Log, method: co.Method) -> float:
+def error(read, method):
     assert read.truth is not None
     return co.rt_le(method(read.recording), read.truth)[0, 0]
 
 
-def filtered(t: Floats, z: Floats, std: float, density: float) -> tuple[Floats, Floats]:
+def filtered(t, z, std, density):
     """filterpy's positions (M, 3) m and velocities m/s after each fix."""
     kf, x, u = KalmanFilter(dim_x=2, dim_z=1), np.empty_like(z), np.empty_like(z)
     for c in range(3):

@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -203,7 +202,7 @@ def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log):
     assert 0.03 < np.nanmean(norm(fleet.velocity, axis=2)) < 0.08
 
 
-def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:
+def small(folder, robots=(1, 2)):
     """Robots that drive side by side for 3 s at unix time, 1 m apart, and measure the next one."""
     folder.mkdir(exist_ok=True)
     t = 1248272272.8 + np.arange(31) / 10

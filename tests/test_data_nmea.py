@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime, timedelta
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,12 +24,12 @@ from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 
 
-def degrees(value: float, wide: int) -> str:
+def degrees(value, wide):
     whole = int(abs(value))
     return f"{whole:0{wide}d}{60 * (abs(value) - whole):011.8f}"
 
 
-def nmea(fleet: co.Fleet, column: int, start: datetime, rmc: bool = True) -> str:
+def nmea(fleet, column, start, rmc=True):
     """A vehicle of a fleet, driven in Munich."""
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, column].T, 48.14, 11.58, 560.0)
     lines = []
@@ -228,16 +227,16 @@ FIRST = ALL | {"truth": "geometry_msgs/PoseStamped", "note": "std_msgs/String"}
 """Topic -> type of all vehicles, and of the first."""
 
 
-def write_bag(path: Path, fleet: co.Fleet, ros: int, truth: str = "truth", late: float = 0.0, invalid: int = -1):
+def write_bag(path, fleet, ros, truth="truth", late=0.0, invalid=-1):
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
 
-    def of(kind: str, *values: Any) -> Any:
+    def of(kind, *values):
         return store.types[kind.replace("/", "/msg/")](*values)
 
-    def at(x: float, y: float = 0.0, z: float = 0.0, kind: str = "Vector3") -> Any:
+    def at(x, y=0.0, z=0.0, kind="Vector3"):
         return of(f"geometry_msgs/{kind}", float(x), float(y), float(z))
 
     serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr

@@ -2,7 +2,6 @@
 
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -169,7 +168,7 @@ def test_a_left_handed_table_is_mirrored(tmp_path):
             load_fleet(tmp_path / "left.csv", scale=scale)
 
 
-def drive(t: np.ndarray, **more: object) -> pd.DataFrame:
+def drive(t, **more: object):
     since = t - t[0]
     return pd.DataFrame({"id": "a", "t": t, "x": 8 * since, "y": 0.5 * since, "z": 0.0, **more})
 
@@ -260,7 +259,7 @@ def test_what_no_memory_holds_is_refused_at_once(tmp_path):
     assert time.process_time() - began < 5.0
 
 
-def segment(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+def segment(folder):
     """A minute on a road to the north-east, as comma2k19 stores it; its fixes in degrees and its true places."""
     t = 5000 + np.arange(0, 60, 0.1)
     fixes = np.c_[37.7 + 1e-6 * np.arange(600), -122.4 + 1e-6 * np.arange(600), 0 * t + 50.0]

@@ -19,7 +19,7 @@ COMMON = replace(WHITE, gnss_common_std=2.0, gnss_drift_time=5.0)
 BOTH = replace(OWN, gnss_common_std=1.0)
 
 
-def convoy(vehicles: int = 4, steps: int = 150, dt: float = 0.1) -> Fleet:
+def convoy(vehicles=4, steps=150, dt=0.1):
     """Vehicles 12 m apart at 10 m/s, the second one leaving for a while in the middle."""
     t = dt * np.arange(steps)
     velocity = np.broadcast_to([10.0, 2.0, 0.0], (steps, vehicles, 3)).copy()

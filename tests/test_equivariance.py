@@ -1,6 +1,5 @@
 """Equivariance: a recording that is moved, turned about z, mirrored in y or renumbered gives the track that is."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,15 +30,15 @@ class Change(NamedTuple):
     order: tuple[int, ...] = tuple(range(8))
 
     @property
-    def matrix(self) -> np.ndarray:  # type: ignore[type-arg]
+    def matrix(self):  # type: ignore[type-arg]
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.diag([1, -1 if self.mirrored else 1, 1])
 
-    def azimuth(self, angle: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def azimuth(self, angle):  # type: ignore[type-arg]
         turned = (-angle if self.mirrored else angle) + self.angle
         return np.arctan2(np.sin(turned), np.cos(turned))
 
-    def of(self, rec: co.Recording) -> co.Recording:
+    def of(self, rec):
         """The recording that the same drive would have given in the changed world."""
         order = np.array(self.order)
         column = np.argsort(order)
@@ -73,9 +72,7 @@ CHANGES = {
 }
 
 
-def assert_equivariant(
-    method: Callable[..., co.Track], rec: co.Recording, change: Change, near: float, egos: tuple[str, ...]
-):
+def assert_equivariant(method, rec, change, near, egos):
     here, there = method(rec, egos), method(change.of(rec), egos)
     assert_allclose(there.x, here.x @ change.matrix.T + change.shift, rtol=0, atol=near)
     if here.covariance is not None:

@@ -1,7 +1,5 @@
 """Links and exchange of a fleet: neighbours by brute force, draws, bytes in closed form, caps and losses."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from conftest import coming_and_going, refused, standing
@@ -17,7 +15,7 @@ S2 = Sensors.paper_scenario2()
 SIDES = "step", "observer", "neighbour"
 
 
-def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_range: float) -> Links:
+def by_brute_force(fleet, observers, most, radius, min_range):
     """Every distance of every step, sorted."""
     rows = []
     for t, position in enumerate(fleet.position):
@@ -28,7 +26,7 @@ def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_r
     return Links(*np.array(rows, int).reshape(-1, 3).T)
 
 
-def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float) -> int:
+def assert_same_links(fleet, observers, most, radius):
     found = sensing.find_links(fleet, observers, V2X(max_neighbours=most, radius=radius), 2.0)
     wanted = by_brute_force(fleet, observers, most, radius, 2.0)
     for name in SIDES:

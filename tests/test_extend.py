@@ -4,9 +4,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from textwrap import indent
 
 import numpy as np
@@ -31,11 +29,11 @@ PAGE = ROOT / "docs" / "extend.md"
 COOPOC = "-W error -m coopoc.cli"
 
 
-def blocks(language: str) -> list[str]:
+def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
 
 
-def shell(command: str, folder: Path, **env: str) -> str:
+def shell(command, folder, **env: str):
     """What a command prints; the test fails with its complaint if it fails."""
     return python(*command.replace("coopoc ", f"{COOPOC} ", 1).split(), cwd=folder, env={**os.environ, **env})
 
@@ -51,11 +49,11 @@ def folder(tmp_path_factory):
     return out
 
 
-def commands(word: str) -> list[str]:
+def commands(word):
     return [line for block in blocks("sh") for line in block.splitlines() if word in line]
 
 
-def output(folder: Path, word: str, change: Callable[[str], str] = str) -> str:
+def output(folder, word, change=str):
     """What the page's block with a word in it prints."""
     (block,) = [text for text in blocks("python") if word in text]
     (folder / "block.py").write_text(change(block))

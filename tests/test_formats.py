@@ -3,7 +3,6 @@
 import time
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from coopoc.formats.graph import ENDS, Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.values import to_orientation, to_rotation
 
 
-def assert_same(a: Any, b: Any, rtol: float = 0):
+def assert_same(a, b, rtol=0):
     """Every field of two graphs is equal, NaN to NaN; covariances to rtol."""
     for field in fields(a):
         one, two = getattr(a, field.name), getattr(b, field.name)
@@ -35,7 +34,7 @@ def assert_same(a: Any, b: Any, rtol: float = 0):
             assert_array_equal(one, two, err_msg=field.name)
 
 
-def random_graph(dimension: int, seed: int) -> Graph:
+def random_graph(dimension, seed):
     """All kinds of edges with full covariances, axes in m and rad scaled apart."""
     names = ("A0", "L5", "A1", "B0", "L7", "B1")
     rng = default_rng(seed)
@@ -73,7 +72,7 @@ def random_graph(dimension: int, seed: int) -> Graph:
     )
 
 
-def written(graph: Graph, path: Path) -> Graph:
+def written(graph, path):
     write_graph(graph, path)
     return load_graph(path)
 
@@ -143,13 +142,13 @@ def test_every_g2o_record_comes_back_to_rounding(tmp_path, dimension, names):
     assert_same(written(graph, tmp_path / "a.g2o"), graph, rtol=1e-12)
 
 
-def _matrices(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def _matrices(position, rotation):
     out = np.tile(np.eye(position.shape[1] + 1), (len(position), 1, 1))
     out[:, :-1, :-1], out[:, :-1, -1] = rotation, position
     return out
 
 
-def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str, int], atol: float = 1e-12):
+def _assert_gtsam_agrees(graph, factors, values, keys, atol=1e-12):
     """Poses, measured poses and covariances; GTSAM orders 3-D covariances rotation first."""
     order = [0, 1, 2] if graph.dimension == 2 else [3, 4, 5, 0, 1, 2]
     at = values.atPose2 if graph.dimension == 2 else values.atPose3

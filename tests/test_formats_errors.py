@@ -1,7 +1,6 @@
 """Every wrong line of a PyFG, g2o or TUM file is named with its place and a hint."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -145,12 +144,12 @@ def test_a_bad_line_of_a_trajectory_is_named(tmp_path, text, thing, hint):
     _assert_refused(lambda: load_fleet(_file(tmp_path / "a.tum", text)), thing, hint)
 
 
-def _file(path: Path, text: str) -> Path:
+def _file(path, text):
     path.write_text(text, errors="surrogateescape")
     return path
 
 
-def _assert_refused(call: Any, *parts: str):
+def _assert_refused(call, *parts):
     with pytest.raises(InputError) as error:
         call()
     for part in parts:

@@ -17,7 +17,7 @@ from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
 from coopoc.optimize.robust import graduated
 
 
-def paper_rho(r: float, mu: float) -> float:
+def paper_rho(r, mu):
     """The surrogate as Yang et al. print it, equation 6, with c = 1."""
     if r**2 <= mu / (mu + 1):
         return r**2

@@ -11,7 +11,7 @@ from conftest import formation_fleet, refused, winding
 from numpy.linalg import norm
 from scipy.stats import chi2
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.scores import scored
 from coopoc.kernels.covariances import DOUBT
@@ -26,7 +26,7 @@ from coopoc.study.tables import lost
 FLEET = winding(300, 10.0, 7.0)
 
 
-def seen(**noise: float) -> Recording:
+def seen(**noise: float):
     return observe(FLEET, Sensors(**noise), V2X(max_neighbours=0), runs=3)  # type: ignore[arg-type]
 
 
@@ -92,7 +92,7 @@ def test_a_filter_is_back_within_five_seconds_of_the_end_of_an_attack(method, dt
 RING = observe(formation_fleet(6, 600), Sensors.paper_scenario2(), V2X(5), runs=2)
 
 
-def faulty(kind: str) -> Recording:
+def faulty(kind):
     """The vehicle in the middle of a ring: its receiver or odometer, or what it has of one neighbour, is wrong from 20
     to 40 s."""
     gnss, velocity, relative, links = RING.gnss.copy(), RING.velocity.copy(), RING.relative.copy(), RING.links

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from shell import ROOT, python, ran
@@ -27,7 +26,7 @@ def site(tmp_path_factory):
     return site
 
 
-def outside(site: Path, tmp_path: Path, *command: str) -> str:
+def outside(site, tmp_path, *command):
     """Output of a command run in an empty folder that sees the installed wheel first."""
     return python(*command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(site), "MYPYPATH": str(site)})
 

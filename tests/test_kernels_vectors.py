@@ -8,7 +8,6 @@ from numpy.linalg import inv, qr, solve
 from numpy.random import default_rng
 from shell import python
 
-from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import as_written
 from coopoc.kernels.compiling.small import inverse, load, store, zeros
 from coopoc.kernels.compiling.vectors import LANES
@@ -18,19 +17,19 @@ BLOCKS, NINE = 4, (0,) * 9
 
 
 @as_written
-def solved(a: Floats, eta: Floats, memory: Floats):
+def solved(a, eta, memory):
     pivot = eliminate(a, a, eta, BLOCKS, BLOCKS, memory)
     substitute(a, eta, BLOCKS, BLOCKS)
     store(memory, 0, pivot)
 
 
 @as_written
-def predicted(a: Floats, process: Floats, memory: Floats):
+def predicted(a, process, memory):
     predict(a, BLOCKS, BLOCKS, process, memory)
 
 
 @as_written
-def inverted(a: Floats):
+def inverted(a):
     store(a, 0, inverse(load(a, 0, zeros(1.0, NINE))))
 
 
@@ -44,7 +43,7 @@ def test_a_covariance_with_an_unknown_angle_keeps_its_digits():
         assert a == pytest.approx((axes / variances @ axes.T).ravel(), abs=1e-5)
 
 
-def blockwise(matrix: Floats, d: int) -> Floats:
+def blockwise(matrix, d):
     return matrix.reshape(BLOCKS, d, BLOCKS, d).swapaxes(1, 2).reshape(-1)
 
 

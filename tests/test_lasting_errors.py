@@ -8,7 +8,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 
 import coopoc as co
-from coopoc import V2X, CooperativeFilter, Fleet, Recording, observe
+from coopoc import V2X, CooperativeFilter, Fleet, observe
 from coopoc.methods.cooperative_filter import ON_ROADS, Priors
 from coopoc.world.body_frames import turned
 from coopoc.world.recording import NOTHING_SIMULATED
@@ -22,7 +22,7 @@ def town():
     return co.load_fleet("town10").between(0, 300)
 
 
-def rms(recording: Recording, fleet: Fleet, **priors: float) -> tuple[float, co.Track]:
+def rms(recording, fleet, **priors: float):
     track = CooperativeFilter(priors=Priors()._replace(**priors))(recording, [3, 8])
     return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(-1).mean())), track
 
@@ -58,7 +58,7 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale, priors):
     assert track.extras["scale_error"][0, -1, 0] == pytest.approx(there * filters[1].x[1, 0], abs=1e-4)
 
 
-def erring(seen: co.Recording) -> co.Recording:
+def erring(seen):
     """All headings 4 degrees off, and all scales 3 %."""
     return replace(seen, velocity=turned(1.03 * seen.velocity, np.full(seen.velocity.shape[:3], 0.07)))
 

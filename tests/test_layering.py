@@ -1,8 +1,6 @@
 """Imports run one way: world, optimize, methods, evaluate, study, cli; and the core names no plug-in package."""
 
 import ast
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from shell import ROOT, python
@@ -14,7 +12,7 @@ FOLDERS = {"coopoc.learned": "learned", "coopoc.studies": "studies", "coopoc.dat
 """Packages that stand in a folder of their own, as pyproject.toml maps them."""
 
 
-def modules(package: str) -> dict[str, Path]:
+def modules(package):
     """Dotted name -> file of every module in a package."""
     folder = ROOT / FOLDERS.get(package, package)
     files = {".".join([package, *p.relative_to(folder).with_suffix("").parts]): p for p in folder.rglob("*.py")}
@@ -24,7 +22,7 @@ def modules(package: str) -> dict[str, Path]:
 CORE = modules("coopoc")
 
 
-def imports(name: str, path: Path) -> Iterator[tuple[str, set[str]]]:
+def imports(name, path):
     """Of every import in a module, also in a function or for types only: the module, and the names taken from it."""
     package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
@@ -67,7 +65,7 @@ def test_imports_run_one_way(module):
             assert {floor, other} != {"formats", "world"}, f"{module} imports {target}: the two stand side by side"
 
 
-def circles(package: str) -> list[list[str]]:
+def circles(package):
     """Modules of a package that import each other in a circle, whatever place an import stands at."""
     files = modules(package)
     arrows: dict[str, set[str]] = {}

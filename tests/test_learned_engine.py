@@ -8,7 +8,6 @@ import torch
 from conftest import refused
 from numba import njit
 from numpy.testing import assert_allclose
-from torch import Tensor
 from torch.testing import assert_close
 
 from coopoc.learned import GainNet
@@ -25,7 +24,7 @@ def _one_core():
         yield
 
 
-def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float64, gaps: float = 0.0) -> Batch:
+def batch(models, lanes, steps, dtype=torch.float64, gaps=0.0):
     """Drives at constant speed; a share `gaps` of the fixes is missing."""
     torch.manual_seed(1)
     velocity = 5 * torch.randn(1, models, lanes, 3, dtype=dtype).expand(steps, -1, -1, -1)
@@ -35,7 +34,7 @@ def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float6
     return Batch(gnss, velocity + noise[1], truth, 0.5 * noise[0, 0], 0.1)
 
 
-def plain(nets: list[GainNet], data: Batch, dt: float | Tensor) -> Tensor:
+def plain(nets, data, dt):
     """(T, S, B, 3) of the reference, a net after the other."""
     rows = [
         Recurrent.forward(net, data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], dt)
@@ -44,7 +43,7 @@ def plain(nets: list[GainNet], data: Batch, dt: float | Tensor) -> Tensor:
     return torch.stack([row.transpose(0, 1) for row in rows], 1)
 
 
-def gradients(nets: list[GainNet], data: Batch, dt: float | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def gradients(nets, data, dt):
     """Estimates and gradients of the squared error, of the engine and by torch's autograd through the reference."""
     theta = flatten(nets)
     found = nets[0].rollout(theta, data.gnss, data.velocity, data.x0, dt)
@@ -55,7 +54,7 @@ def gradients(nets: list[GainNet], data: Batch, dt: float | Tensor) -> tuple[Ten
     return found, mine, expected.detach(), by_torch
 
 
-def grad(leaf: Tensor) -> Tensor:
+def grad(leaf):
     assert leaf.grad is not None
     return leaf.grad
 

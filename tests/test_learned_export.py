@@ -34,7 +34,7 @@ def file(shipped, tmp_path_factory):
     return to_onnx(shipped, tmp_path_factory.mktemp("export") / "step.onnx")
 
 
-def steps(file: Path) -> Step:
+def steps(file):
     """The step of an exported file."""
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     return lambda arrays: session.run(list(OUTPUTS), dict(zip(INPUTS, arrays, strict=True)))

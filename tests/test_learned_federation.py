@@ -1,7 +1,6 @@
 """Federation: laws on gains that are no net; rules against Flower's own, SciPy and closed forms; Byzantine clients."""
 
 import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import Any
@@ -13,11 +12,10 @@ from aggregation import Byzantine
 from conftest import refused, winding
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
-from torch import Tensor, nn
+from torch import nn
 
-from coopoc import Fleet, Sensors
-from coopoc.arrays import Floats
-from coopoc.learned import Client, GainNet, Schedule, clients, federate
+from coopoc import Sensors
+from coopoc.learned import GainNet, Schedule, clients, federate
 from coopoc.learned.federation.federate import Participation
 from coopoc.learned.federation.history import Federation, Round, ledger
 from coopoc.learned.federation.rules import (
@@ -33,23 +31,21 @@ from coopoc.learned.federation.rules import (
     screen,
 )
 from coopoc.learned.nets.gain import Gain, flatten
-from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.fit import Judge
-from coopoc.methods.track import Method
 
 
 class Steady(Gain):
     """A filter with one constant gain per axis: x <- x + dt u + k (z - x - dt u)."""
 
-    def __init__(self, gain: float = 0.3):
+    def __init__(self, gain=0.3):
         super().__init__()
         self.gain = nn.Parameter(torch.full((3,), gain))
 
     @property
-    def settings(self) -> Mapping[str, Any]:
+    def settings(self):
         return {}
 
-    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
+    def losses(self, theta, batch):
         x, error = batch.x0, torch.zeros(batch.x0.shape[:2])
         for fix, speed, truth in zip(batch.gnss, batch.velocity, batch.truth, strict=True):
             x = x + batch.dt * speed
@@ -58,11 +54,11 @@ class Steady(Gain):
             error = error + (gap[..., 0].square() + gap[..., 1].square() + gap[..., 2].square())
         return error / len(batch.truth)
 
-    def method(self, name: str, x0: Floats | None = None) -> Method:
+    def method(self, name, x0=None):
         raise NotImplementedError
 
 
-def drives(count: int = 4) -> Fleet:
+def drives(count=4):
     """Vehicles that turn, a little apart in their course."""
     return winding(130, vehicles=count)
 
@@ -72,7 +68,7 @@ def four():
     return clients(drives(), piece=10)
 
 
-def trained(group: Sequence[Client], rounds: int = 3, model: Gain | None = None, **options: Any) -> Federation:
+def trained(group, rounds=3, model=None, **options: Any):
     """A short federation of constant gains."""
     return federate(
         model or Steady(), group, rounds, **{"local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options}
@@ -100,7 +96,7 @@ class Faulty(Participation):
 
     faults: tuple[tuple[str, str], ...] = ()
 
-    def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
+    def answer(self, name, theta, weights):
         """NaN, another shape, or a change a thousand times too large."""
         wrong = {"nan": weights + torch.nan, "shape": weights[:-1], "far": theta + 1000 * (weights - theta)}
         return wrong.get(dict(self.faults).get(name, ""), weights)
@@ -230,12 +226,12 @@ def test_a_score_does_not_depend_on_who_is_judged_beside():
 SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])
 
 
-def answers(clients: int = 7, size: int = 40, seed: int = 0) -> Tensor:
+def answers(clients=7, size=40, seed=0):
     """(C, P) weights in float64."""
     return torch.randn((clients, size), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def combined(which: Rule, weights: Tensor, sizes: Tensor = SIZES) -> Tensor:
+def combined(which, weights, sizes=SIZES):
     """What a rule makes of one round from zero."""
     return which(torch.zeros_like(weights[0]), weights, sizes)
 
@@ -250,7 +246,7 @@ def flower():
     return strategy
 
 
-def replies(weights: Tensor, sizes: Tensor) -> list[Any]:
+def replies(weights, sizes):
     """Flower's messages with these weights, split into two arrays as a net would be, and numbers of examples."""
     from flwr.app import Array, ArrayRecord, Message, MetricRecord, RecordDict
     from flwr.app.metadata import Metadata
@@ -268,7 +264,7 @@ def replies(weights: Tensor, sizes: Tensor) -> list[Any]:
     ]
 
 
-def flat(record: Any) -> Tensor:
+def flat(record):
     """Flower's arrays as one row."""
     return torch.from_numpy(np.concatenate([record[name].numpy().ravel() for name in "ab"]))
 
@@ -373,7 +369,7 @@ def test_weights_that_are_not_finite_are_never_taken():
         combine(rule(lambda w, n: w), Standing(torch.zeros(2)), given)
 
 
-def federation(losses: np.ndarray) -> Federation:  # type: ignore[type-arg]
+def federation(losses):  # type: ignore[type-arg]
     """A history with these losses (rounds, C)."""
     names = tuple(f"c{i}" for i in range(losses.shape[1]))
     rows = [Round(k, torch.zeros(1), (nan,) * len(row), tuple(row)) for k, row in enumerate(losses.tolist())]

@@ -3,7 +3,7 @@
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from itertools import product
@@ -16,13 +16,10 @@ import torch
 from conftest import refused, winding
 from logs import long, observed, write
 from shell import ROOT
-from torch import Tensor
 
-from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import clients, federate, load
-from coopoc.learned.federation.history import Federation
 from coopoc.learned.flower import client_app, rounds
 from coopoc.learned.flower.client import job_of
 from coopoc.learned.flower.server import Row, federation
@@ -46,17 +43,17 @@ pytestmark = [
 ]
 
 
-def drives(vehicles: int = 4, steps: int = 100) -> Fleet:
+def drives(vehicles=4, steps=100):
     """Vehicles that wind about."""
     return winding(steps, 9.0, 4.0, vehicles)
 
 
-def in_process(job: Job, fleet: Fleet) -> Federation:
+def in_process(job, fleet):
     recipe, seed, own = job.recipe, job.setting.seed, job_clients(job, fleet)
     return federate(untrained(job), own, recipe.rounds, recipe.aggregate, recipe.local_epochs, seed, recipe.schedule)
 
 
-def honest(job: Job, fleet: Fleet, vehicle: int) -> Node:
+def honest(job, fleet, vehicle):
     """The ClientApp of one vehicle, as Flower calls it."""
     from flwr.app import Context, RecordDict
 
@@ -64,12 +61,12 @@ def honest(job: Job, fleet: Fleet, vehicle: int) -> Node:
     return lambda message: app(message, Context(1, vehicle, {}, RecordDict(), {}))
 
 
-def vehicles(job: Job, fleet: Fleet, count: int) -> dict[int, Node]:
+def vehicles(job, fleet, count):
     """The first ones by their number."""
     return {i: honest(job, fleet, i) for i in range(count)}
 
 
-def room(nodes: Mapping[int, Node]) -> Any:
+def room(nodes):
     """A Flower grid without a network: every node answers at once, in the opposite order."""
     from flwr.serverapp import Grid
     from flwr.supercore.task_identity import TaskIdentity
@@ -98,7 +95,7 @@ def room(nodes: Mapping[int, Node]) -> Any:
     return Room()
 
 
-def deployed(job: Job, nodes: Mapping[int, Node]) -> tuple[list[Row], Federation]:
+def deployed(job, nodes):
     rows: list[Row] = []
     rounds(room(nodes), job, len(nodes), 5.0, rows.append, {})
     return rows, federation(rows, job, 0.0)
@@ -118,7 +115,7 @@ def test_the_rounds_are_those_of_federate(rule):
     assert found.best.number == 1 + int(np.argmin([expected.validation_loss(row) for row in expected.history[1:]]))
 
 
-def sends(name: str, weights: Tensor, **changes: object) -> Node:
+def sends(name, weights, **changes: object):
     """A node that answers with these weights, and with values of its own."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 

@@ -12,10 +12,8 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,12 +22,11 @@ from shell import ROOT, ran
 from test_learned_flower import in_process
 from test_learned_flower import pytestmark as flower
 
-from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.learned import load
 from coopoc.learned.federation.federate import adapt
 from coopoc.learned.flower.client import job_of
-from coopoc.learned.recipes import Job, job_clients, untrained
+from coopoc.learned.recipes import job_clients, untrained
 
 TINY = {"local-epochs": 1, "piece": 10, "net-in-mult": 2, "net-out-mult": 1}
 CHANGE = " ".join(f"{key}={value}" for key, value in TINY.items())
@@ -40,7 +37,7 @@ pytestmark = [
 ]
 
 
-def each(fleet: Fleet) -> dict[str, Fleet]:
+def each(fleet):
     return {vehicle: fleet.select([vehicle]) for vehicle in fleet.ids}
 
 
@@ -66,7 +63,7 @@ def mark(monkeypatch):
     until(lambda: alive(word) == [], 20)
 
 
-def alive(word: str) -> list[str]:
+def alive(word):
     """Command lines of the processes, but this one, with this word in their environment."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
@@ -76,7 +73,7 @@ def alive(word: str) -> list[str]:
     return found
 
 
-def until(true: Callable[[], bool], seconds: float = 300):
+def until(true, seconds=300):
     """Wait for something."""
     end = time.monotonic() + seconds
     while not true():
@@ -84,7 +81,7 @@ def until(true: Callable[[], bool], seconds: float = 300):
         time.sleep(0.1)
 
 
-def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
+def checked(path, job, fleet):
     """The card of a checkpoint whose weights are, round by round, NumPy's average of what the clients that counted
     made."""
     plan, found = job.recipe.plan, load(path)
@@ -97,7 +94,7 @@ def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
     return found.card
 
 
-def script(folder: Path, *options: object) -> list[str]:
+def script(folder, *options):
     """The command line of the example, for three rounds."""
     words = sys.executable, ROOT / "examples" / "flower_deployment.py", "--folder", folder, "--rounds", 3, *options
     return [str(word) for word in words]

@@ -14,7 +14,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
-from coopoc import V2X, Fleet, Recording, Sensors, observe
+from coopoc import V2X, Fleet, Sensors, observe
 from coopoc.cli import main
 from coopoc.learned import GainNet, NoiseParameters, Schedule, Segments, load_method, train_all
 from coopoc.learned.checkpoint import read_card
@@ -26,7 +26,7 @@ from coopoc.learned.training.drives import MeasuredDrives, measured_clients
 NETS = (GainNet(2, 1), NoiseParameters())
 
 
-def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> tuple[Recording, Fleet]:
+def walk(steps=400, vehicles=2, seed=0, every=1):
     """Vehicles that stand by their odometry and move by N(0, 0.2^2) m a step: the noise of both is known exactly."""
     rng, t = default_rng(seed), np.arange(steps) / 10
     position = np.cumsum(rng.normal(0, 0.2, (steps, vehicles, 3)), axis=0)
@@ -34,7 +34,7 @@ def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> 
     return slow_fixes(observe(fleet, Sensors(gnss_std=(1.5, 1.5, 1.5)), V2X(max_neighbours=0)), every), fleet
 
 
-def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:
+def batch(seed=0, steps=30, lanes=4):
     draw = torch.Generator().manual_seed(seed)
     truth = torch.randn((steps, 1, lanes, 3), generator=draw).cumsum(0)
     noise = torch.randn((2, steps, 1, lanes, 3), generator=draw)

@@ -31,7 +31,7 @@ def test_parameter_count(in_mult, out_mult, count):
 class Published(nn.Module):
     """KalmanNet architecture 2 as described in its paper, with nn.GRU over sequences of one step; same weights."""
 
-    def __init__(self, net: GainNet):
+    def __init__(self, net):
         super().__init__()
         self.net = net
         self.grus = {}
@@ -41,10 +41,10 @@ class Published(nn.Module):
             gru.load_state_dict({f"{key}_l0": value for key, value in cell.state_dict().items()})
             self.grus[name] = gru
 
-    def run(self, name: str, x: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+    def run(self, name, x, h):
         return self.grus[name](x[None], h[None])[1][0]
 
-    def forward(self, gnss: torch.Tensor, velocity: torch.Tensor, x0: torch.Tensor, dt: float) -> torch.Tensor:
+    def forward(self, gnss, velocity, x0, dt):
         def unit(v):
             return v / torch.clamp(torch.sqrt((v * v).sum(1, keepdim=True)), min=1e-12)
 
@@ -80,7 +80,7 @@ def test_wiring_and_features_as_published():
             torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
-def constant(gain: np.ndarray) -> GainNet:
+def constant(gain):
     """A net whose gain is constant: the last layer's weights are zero and its bias is the gain."""
     net = GainNet()
     with torch.no_grad():

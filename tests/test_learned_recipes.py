@@ -11,7 +11,7 @@ from conftest import refused, winding
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
-from coopoc import GNSS, V2X, Fleet, Outliers, Sensors, load_fleet, observe
+from coopoc import GNSS, V2X, Outliers, Sensors, load_fleet, observe
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import (
     Checkpoint,
@@ -28,7 +28,7 @@ from coopoc.learned.checkpoint import read_card, write
 from coopoc.learned.nets.gain import flatten
 
 
-def drives() -> Fleet:
+def drives():
     return replace(winding(80, 9.0, 4.0, 2), name="pair")
 
 

@@ -8,7 +8,7 @@ import torch
 from conftest import refused, winding, without
 
 import coopoc.learned.training.fit as train
-from coopoc import Fleet, Sensors
+from coopoc import Sensors
 from coopoc.learned import GainNet, Schedule, Segments, clients, federate, fit
 from coopoc.learned.nets.gain import Recurrent, flatten
 from coopoc.learned.training.clients import mirrored
@@ -17,7 +17,7 @@ from coopoc.learned.training.schedule import cosine
 QUICK = Schedule(epochs=6, batch=2, checks=3)
 
 
-def drives(lengths: tuple[int, ...] = (130, 260)) -> Fleet:
+def drives(lengths=(130, 260)):
     """Drives of these lengths, absent afterwards."""
     return without(
         winding(max(lengths), 9.0, 4.0, len(lengths)), *((slice(length, None), k) for k, length in enumerate(lengths))

@@ -12,20 +12,20 @@ LINK = re.compile(r"\]\(<?([^)<>\s]+)>?(?:\s[^)]*)?\)|^\[[^\]]+\]:\s+(\S+)|(?:sr
 CODE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 
 
-def tracked() -> set[str]:
+def tracked():
     """Files of the repository, and their folders."""
     files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     names = set(files.split("\0")) - {""}
     return names | {str(folder) for name in names for folder in Path(name).parents}
 
 
-def heads(text: str) -> set[str]:
+def heads(text):
     """Anchors of a page's headings, as GitHub and the site name them."""
     titles = re.findall(r"^#+ (.*)", CODE.sub(lambda m: m[0].strip("`") if m[1] is None else "", text), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
 
-def broken(page: str, text: str, there: set[str]) -> list[str]:
+def broken(page, text, there):
     """Relative links of a page that lead to no tracked file, or to no heading of one."""
     found = []
     for groups in LINK.findall(CODE.sub("", text)):

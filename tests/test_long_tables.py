@@ -11,7 +11,7 @@ rng = np.random.default_rng(5)
 IDS = ("red", "green", "blue")
 
 
-def track() -> co.Track:
+def track():
     shape = 2, 4, 2
     root = rng.normal(size=(*shape, 3, 3))
     heading = rng.uniform(-3, 3, shape)

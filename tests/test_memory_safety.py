@@ -44,7 +44,7 @@ def test_the_error_names_field_value_and_allowed(parts, words):
         corrupted.with_parts(corrupted.recording(), **parts)
 
 
-def program(*given: str, **env: str) -> str:
+def program(*given, **env: str):
     """What tests/corrupted.py complains about, in a process that may crash."""
     done = ran([sys.executable, str(Path(corrupted.__file__)), *given], env={**os.environ, **env})
     assert done.returncode in (0, 1), f"{given}: ended by signal {-done.returncode}\n{done.stderr[-2000:]}"

@@ -23,7 +23,7 @@ SNAPSHOTS = [QCQPRelaxation(), QCQPRelaxation("identity")]
 METHODS = [*FILTERS, *SNAPSHOTS]
 
 
-def label(method: object) -> str:
+def label(method):
     return f"{method.name}-{method.noise_model}"  # type: ignore[attr-defined]
 
 

@@ -56,10 +56,10 @@ RAGGED: tuple[Any, ...] = ([[1], [2, 3]], np.datetime64("2024-01-01"), np.array(
 class Foreign:
     """An object of a library of which nothing is known: it is no array, and has not even a text."""
 
-    def __array__(self, *_given: Any, **_options: Any) -> Any:
+    def __array__(self, *_given, **_options: Any):
         raise RuntimeError("no array")
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         raise RuntimeError("no text")
 
 
@@ -89,7 +89,7 @@ RECORDING = co.observe(FLEET, SENSORS, CHANNEL)
 TRACK = co.Kalman()(RECORDING, [0, 1])
 
 
-def ours(call: Callable[[], object], what: str):
+def ours(call, what):
     """The call has an answer, or ends in an error of ours."""
     try:
         call()
@@ -148,7 +148,7 @@ def test_a_noun_keeps_no_array_that_its_owner_can_change():
                 assert not any(a.flags.writeable for a in vars(part).values() if isinstance(a, np.ndarray) and a.size)
 
 
-def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL):
+def swept(make, given, wrong=ALL):
     """Each argument once with each wrong value, the others as given."""
     for name in given:
         for value in wrong:
@@ -156,7 +156,7 @@ def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, 
             ours(call, f"{name}={shown(value, 40)}")
 
 
-def init(instance: Any) -> dict[str, Any]:
+def init(instance):
     """The arguments that a dataclass was made with; priors are checked one by one."""
     return {f.name: getattr(instance, f.name) for f in fields(instance) if f.init and f.name != "priors"}
 
@@ -170,24 +170,24 @@ BYTES = co.Ledger(("a",), [9.0], np.ones((2, 1, 1)), np.ones((2, 1, 1)))
 NOISE = replace(SENSORS, **dict.fromkeys(ANGULAR, 0.07))
 
 
-def follow(kind: Any, recording: Any, egos: Any, **options: Any) -> Any:
+def follow(kind, recording, egos, **options: Any):
     return kind(**options)(recording, egos)
 
 
-def own(gate: Any, **measured: Any) -> Any:
+def own(gate, **measured: Any):
     return co.PoseFilter("solo", assumed=SENSORS, gate=gate).start(0.1, np.zeros(4)).step(co.OwnMeasurement(**measured))
 
 
-def solo(x0: Any, interval: Any, history: Any, **step: Any) -> Any:
+def solo(x0, interval, history, **step: Any):
     return co.Kalman("identity").start(x0, interval=interval, history=history).step(**step)
 
 
-def star(gnss: Any, velocity: Any, dt: Any, fix_age: Any, **neighbour: Any) -> Any:
+def star(gnss, velocity, dt, fix_age, **neighbour: Any):
     stream = co.StarStream(co.CooperativeFilter(co.NoiseModel.nominal(SENSORS)), [0.0, 0.0, 0.0])
     return stream.step(gnss, velocity, dt, fix_age, [co.RelativeMeasurement(gnss=gnss, velocity=velocity, **neighbour)])
 
 
-def least_squares(nodes: Any, z: Any, std: Any, x0: Any) -> Any:
+def least_squares(nodes, z, std, x0):
     return co.solve(replace(PAIR, x0=x0).add("range", nodes, z, std=std)).x
 
 
@@ -197,7 +197,7 @@ MESSAGE: dict[str, Any] = {"id": "b", "relative": [9.0, 0.7, 1.57], "age": 0.1, 
 MESSAGE |= {"variance": [1.0, 1.0, 1.0], "odometer": [0.0, 1.0, 2.0]}
 
 
-def drawn(plot: Any, **given: Any) -> None:
+def drawn(plot, **given: Any):
     plot(**given)
 
 
@@ -303,14 +303,14 @@ LABELS = ("name", "source", "licence", "id", "notes")
 ANGLES = (*ANGULAR, "heading", "yaw_rate", "relative", "begin", "turn", "compass")
 
 
-def first(value: Any, wrong: float) -> Any:
+def first(value, wrong):
     """The numbers with one wrong one, or the number itself."""
     array = np.array(value, float)
     array.flat[0] = wrong
     return array if array.ndim else wrong
 
 
-def others(value: Any) -> Any:
+def others(value):
     """The same of other vehicles, or a name that is none."""
     ids = tuple(f"other {name}" for name in getattr(value, "ids", ()))
     return replace(value, ids=ids) if ids else "nobody"
@@ -325,14 +325,14 @@ CHANGES: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def arrays(found: Any) -> list[Any]:
+def arrays(found):
     if isinstance(found, np.ndarray | float | np.floating):
         return [np.asarray(found, float)]
     parts = found if isinstance(found, list | tuple) else vars(found).values() if hasattr(found, "__dict__") else ()
     return [array for part in parts for array in arrays(part)]
 
 
-def answered(found: Any, right: Any, change: str) -> bool:
+def answered(found, right, change):
     """Whether there is a note, or no number is less finite than it was; of other names and degrees the same numbers."""
     if getattr(found, "notes", ()):
         return True

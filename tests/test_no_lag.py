@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from oracles.pace import heard
 from oracles.solo import filterpys
 
-from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, Fleet, Kalman, NoiseModel, Sensors, observe
 from coopoc.methods.catalogue import METHODS
 from coopoc.world.inbox import inbox
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -22,7 +22,7 @@ estimate forward. A smoother sees the road from both sides."""
 
 
 @cache
-def road(vehicles: int = 3, steps: int = 60) -> tuple[Fleet, Recording]:
+def road(vehicles=3, steps=60):
     """A straight road eastward, in steps of 1 s, and noise that is white and known."""
     t = np.arange(float(steps))
     x, u = np.zeros((2, steps, vehicles, 3))

@@ -1,8 +1,6 @@
 """Noise from a tenth of a millimetre to ten kilometres, in line, far away, close together: estimates that stay sane."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ STEPS = 15
 COOPERATIVE = [name for name, make in METHODS.items() if make("nominal").cooperative]
 
 
-def in_line(count: int, gap: float, offset: float = 0.0) -> co.Fleet:
+def in_line(count, gap, offset=0.0):
     """Vehicles one behind the other along x at 10 m/s."""
     t = np.arange(STEPS) / 10
     position, velocity = np.full((STEPS, count, 3), offset), np.zeros((STEPS, count, 3))
@@ -28,7 +26,7 @@ def in_line(count: int, gap: float, offset: float = 0.0) -> co.Fleet:
     return co.Fleet(tuple(f"v{i}" for i in range(count)), t, position, velocity)
 
 
-def drawn(seed: int) -> tuple[co.Fleet, co.Sensors]:
+def drawn(seed):
     """A fleet in line or scattered, each standard deviation anywhere within eight orders of magnitude."""
     rng = default_rng(seed)
     gap, count = float(10 ** rng.uniform(0.5, 2)), int(rng.integers(2, 7))
@@ -52,16 +50,16 @@ def drawn(seed: int) -> tuple[co.Fleet, co.Sensors]:
     )
 
 
-def off(x: Any, fleet: co.Fleet) -> Any:
+def off(x, fleet):
     """Of the first vehicle, m."""
     return x[:, :, 0] - fleet.position[:, 0]
 
 
-def observed(fleet: co.Fleet, sensors: co.Sensors, runs: int = 2, seed: int = 0) -> co.Recording:
+def observed(fleet, sensors, runs=2, seed=0):
     return co.observe(fleet, sensors, co.V2X(max_neighbours=10), runs=runs, seed=seed)
 
 
-def situations() -> Iterator[tuple[str, co.Fleet, co.Sensors]]:
+def situations():
     """Geometries and noises that leave little of sixteen digits."""
     for seed in range(8):
         yield f"drawn {seed}", *drawn(seed)
@@ -140,7 +138,7 @@ def test_the_smoother_descends_where_whole_steps_lead_away():
     assert error.max() < 3.0 * abs(off(recording.gnss, fleet)).max()
 
 
-def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Recording]]) -> dict[str, float]:
+def errors_of(names, words, drives):
     """Rms error of the first vehicle, m; all but kalman say the words in a note."""
     squares: dict[str, list[np.ndarray]] = {}
     for fleet, recording in drives:
@@ -167,7 +165,7 @@ def test_a_fine_range_in_a_coarse_direction_is_not_taken_for_exact(range_std, an
     assert all(each < 4.0 * error["kalman"] for each in error.values()), error
 
 
-def without_azimuth(recording: co.Recording) -> co.Recording:
+def without_azimuth(recording):
     relative = recording.relative.copy()
     relative[..., 1] = nan
     return replace(recording, relative=relative)

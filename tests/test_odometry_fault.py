@@ -10,7 +10,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 
 import coopoc as co
-from coopoc import V2X, CooperativeFilter, JointFilter, Kalman, NoiseModel, Recording, observe
+from coopoc import V2X, CooperativeFilter, JointFilter, Kalman, NoiseModel, observe
 from coopoc.arrays import Floats
 from coopoc.kernels.odometry_fault import MAX_Q, NOISIER, PACES, UNKNOWN
 from coopoc.methods.odometry_fault import with_odometry
@@ -32,7 +32,7 @@ LOOK_ALIKE: dict[str, Callable[[Floats], Floats]] = {
 }
 
 
-def drive(every: int, std: float, most: int = 0, act: float = 1.0) -> tuple[Recording, Floats]:
+def drive(every, std, most=0, act=1.0):
     """A minute in town with a fix at every so many steps, and the truth."""
     town = co.load_fleet("town10").between(0, STEPS)
     stated = replace(S2, gnss_std=(std,) * 3)

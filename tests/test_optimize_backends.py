@@ -44,7 +44,7 @@ def test_where_plain_gauss_newton_overshoots_for_ever(backend):
     assert cycling > 0
 
 
-def scipys(problem: Problem) -> tuple[np.ndarray, float]:
+def scipys(problem):
     """SciPy's trust-region solver from the same start, with its own difference Jacobian."""
 
     def residual(flat):

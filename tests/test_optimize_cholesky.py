@@ -13,7 +13,7 @@ from coopoc.optimize.algebra.cholesky import Cholesky
 from coopoc.workers import one_thread
 
 
-def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
+def graph_matrix(seed, nodes, pairs, width):
     """J^T J of a chain of nodes and of random pairs, each with a full block of rows; a prior on the first."""
     rng = default_rng(seed)
     k = np.arange(nodes - 1)
@@ -26,7 +26,7 @@ def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
     return whole.T @ whole
 
 
-def upper(matrix: np.ndarray) -> csc_matrix:
+def upper(matrix):
     found = csc_matrix(triu(csc_matrix(matrix)))
     found.sort_indices()
     return found

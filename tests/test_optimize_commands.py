@@ -39,7 +39,7 @@ def file(tmp_path):
     return path
 
 
-def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+def run(capsys, *words):
     return _status([*words]), *capsys.readouterr()
 
 

@@ -12,7 +12,7 @@ from coopoc.optimize.assess.assess import newton_decrease
 from coopoc.optimize.starts import race
 
 
-def tangle(seed: int) -> Problem:
+def tangle(seed):
     """Every nonlinear kind, measured far from where the points are: curvature of either sign."""
     rng = np.random.default_rng(seed)
     problem = Problem([*"abcd"], x0=rng.normal(size=(4, 3)) * 10)

@@ -20,7 +20,7 @@ from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.problem import Search
 
 
-def ranged(seed: int) -> Problem:
+def ranged(seed):
     """Eight points in space from random starts: three have a fix, and all ranges between them are measured."""
     rng, pairs = np.random.default_rng(seed), np.column_stack(np.triu_indices(8, 1))
     truth, x0 = rng.uniform(-20, 20, (2, 8, 3))

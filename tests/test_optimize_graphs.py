@@ -3,7 +3,6 @@ GTSAM's; and real graphs that GTSAM brings."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -19,7 +18,7 @@ from unseen_graphs import drone, range_aided, world
 import coopoc as co
 from coopoc.formats.graph import PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
-from coopoc.optimize.algebra.sparse import Sparse, sparse
+from coopoc.optimize.algebra.sparse import sparse
 from coopoc.optimize.assess.assess import DENSE_COLUMNS, _seen, as_stated, assess, expected, newton_decrease
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
@@ -116,7 +115,7 @@ def test_tapes_are_the_formulas(dimension, objective, loss):
         assert upper(system, values) == pytest.approx(np.triu(exact), abs=3e-6 * abs(exact).max())
 
 
-def upper(system: Sparse, values: np.ndarray) -> np.ndarray:
+def upper(system, values):
     """The upper triangle of a Hessian."""
     entries, size = system.entries, system.size
     return csc_array((values, entries.indices, entries.indptr), shape=(size, size)).toarray()
@@ -135,7 +134,7 @@ def test_a_formula_that_casadi_cannot_run_is_refused():
         del MEASUREMENTS["half_range_of_test"]
 
 
-def assert_gtsams_marginals(covariance: np.ndarray, problem: Problem, x: np.ndarray):
+def assert_gtsams_marginals(covariance, problem, x):
     """The covariances are those of GTSAM's Bayes tree, and zero where a number cannot move."""
     still, J = ~problem.movable, as_stated(problem).whiten(x)[1]
     theirs = bayes_tree_marginals(J, still, len(problem.names), problem.space.dof)
@@ -175,7 +174,7 @@ def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_ba
     assert found.remaining < 1e-6
 
 
-def gtsams(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.LevenbergMarquardtOptimizer]:
+def gtsams(problem):
     native, at = graph_of(problem, forms(problem)), values(problem.space, which_turn(problem), problem.x0)
     return native, gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams())
 
@@ -364,7 +363,7 @@ its logarithm, and a landmark by bearing and range, not by its place."""
 DATA = Path(gtsam.__file__).parent / "Data"
 
 
-def least(graph: Any, values: Any, first: Any) -> float:
+def least(graph, values, first):
     """Cost of GTSAM's Levenberg-Marquardt with the first pose where the file has it."""
     d = 3 if isinstance(first[1], gtsam.Pose3) else 2
     graph.add(getattr(gtsam, f"PriorFactorPose{d}")(*first, gtsam.noiseModel.Constrained.All(3 * (d - 1))))

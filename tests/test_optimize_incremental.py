@@ -15,18 +15,18 @@ TRUE = [gtsam.Pose2(np.cos(0.3 * k) * 5.0, np.sin(0.3 * k) * 5.0, 0.3 * k) for k
 MARKS = {"l0": np.array([0.0, 1.0]), "l1": np.array([8.0, -3.0])}
 
 
-def measured() -> tuple[list[gtsam.Pose2], list[tuple[int, str, float]]]:
+def measured():
     """Odometry, and the landmark that each pose ranges."""
     rng = np.random.default_rng(3)
     moved = [a.between(b).compose(gtsam.Pose2(*(STD * rng.normal(size=3)))) for a, b in pairwise(TRUE)]
     return moved, [(k, f"l{k % 2}", TRUE[k].range(MARKS[f"l{k % 2}"]) + 0.1 * rng.normal()) for k in range(1, 25)]
 
 
-def our_pose(pose: gtsam.Pose2) -> np.ndarray:
+def our_pose(pose):
     return co.pose(pose.translation(), pose.theta())
 
 
-def followed(loss: Loss | None = None, lag: int = 0) -> Incremental:
+def followed(loss=None, lag=0):
     """One step per pose."""
     moved, far = measured()
     start = co.Problem(("x0",), dimension=2, poses=(0,), x0=our_pose(TRUE[0])[None])
@@ -46,7 +46,7 @@ def followed(loss: Loss | None = None, lag: int = 0) -> Incremental:
     return live
 
 
-def batch() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def batch():
     """GTSAM's graph by hand, whose poses have keys 0, 1, ... and landmarks 100, 101, and its optimum."""
     (moved, far), sigmas = measured(), gtsam.noiseModel.Diagonal.Sigmas
     graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -31,7 +31,7 @@ def test_a_joint_covariance_is_a_part_of_the_inverse(dimension, steps):
     assert joint[1, 1] == pytest.approx(found.covariance[places[1]], rel=1e-6)
 
 
-def ring() -> Problem:
+def ring():
     """Points with fixes and distances around a ring."""
     rng, names = np.random.default_rng(2), [f"p{k}" for k in range(30)]
     at = np.c_[20 * np.cos(np.arange(30) / 5), 20 * np.sin(np.arange(30) / 5)]

@@ -1,7 +1,5 @@
 """Measurements: one formula for NumPy, torch and CasADi; the tapes' derivatives against torch's."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,6 @@ from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
 from coopoc.optimize import MEASUREMENTS, Problem, measurement
-from coopoc.optimize.model.measurements import Measurement
 from coopoc.optimize.model.space import Space, exp, pose
 
 VECTORS = default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
@@ -54,7 +51,7 @@ def test_derivatives_equal_torchs(kind, dimension):
         assert np.exp(1j * linear.residual[0][k]) == pytest.approx(np.exp(1j * gap), abs=1e-12)  # angles wrap
 
 
-def by_torch(known: Measurement, d: int, x: Any, z: Any, constants: Any, steps: Any) -> Any:
+def by_torch(known, d, x, z, constants, steps):
     """h - z after the steps (arity, dof) of nodes x (arity, ambient)."""
     at, w = x[:, :d] + steps[:, :d], steps[:, d:]
     zero = torch.zeros_like(w[:, 0])
@@ -74,7 +71,7 @@ def by_torch(known: Measurement, d: int, x: Any, z: Any, constants: Any, steps: 
     )
 
 
-def errors(known: Measurement, rotations: Any, z: Any) -> Any:
+def errors(known, rotations, z):
     return np.column_stack(known.residual([*VECTORS.T, *rotations.reshape(-1, 9).T], [*z.T], (), np))
 
 

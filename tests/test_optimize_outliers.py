@@ -10,11 +10,10 @@ from conftest import refused
 from graph_files import write_graph
 from hard_graphs import kept
 from numpy.linalg import det, inv, solve
-from unseen_graphs import World, alignment_error, blocks, joined, lost, world, wrong
+from unseen_graphs import alignment_error, blocks, joined, lost, world, wrong
 
 import coopoc as co
-from coopoc.arrays import Bools, Ints
-from coopoc.formats.graph import Graph, PoseEdges
+from coopoc.arrays import Ints
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
@@ -23,7 +22,7 @@ from coopoc.optimize.robust.loop_closures import predicted
 from coopoc.optimize.solver_commands import solve_file
 
 
-def drive(seed: int, steps: int = 400, loops: int = 120, share: float = 0.4) -> tuple[Graph, Bools]:
+def drive(seed, steps=400, loops=120, share=0.4):
     """A robot that walks on a grid of streets and closes loops, a share of which is anything; which these are."""
     w = blocks(seed, steps)
     graph = w.graph(
@@ -32,7 +31,7 @@ def drive(seed: int, steps: int = 400, loops: int = 120, share: float = 0.4) -> 
     return graph, wrong(graph)
 
 
-def from_known(graph: Graph) -> tuple[co.Solution, Ints, Bools]:
+def from_known(graph):
     """The answer of GNC that begins with odometry, its candidates, and which of them it rejects."""
     problem = from_graph(graph, start="odometry")
     ((factor, rows),) = loop_closures(problem)
@@ -104,18 +103,18 @@ def test_the_command_names_what_it_rejects(tmp_path, capsys):
         solve_file(tmp_path / "chain.g2o", outliers=True)
 
 
-def fleet(loops: PoseEdges, drives: World) -> Graph:
+def fleet(loops, drives):
     """Odometry and measurements between robots, with the truth in the vertices."""
     return drives.graph(relative_pose=joined(drives.relative(drives.chain(), 0.05, 0.02), loops))
 
 
-def between(seed: int, d: int, robots: int, count: int, share: float = 0.0) -> tuple[World, PoseEdges]:
+def between(seed, d, robots, count, share=0.0):
     """Robots that drive about the same square, and relative poses between them, a share of which is anything."""
     drives = world(seed, d, robots, 120, size=20.0)
     return drives, drives.relative(drives.near(count, 12.0, others=True), 0.1, 0.03, share)
 
 
-def judged(graph: Graph, bad: Bools) -> tuple[co.Solution, list[int], list[float]]:
+def judged(graph, bad):
     """The answer where nothing says where any robot begins, how many wrong ones it keeps and right ones it loses, and
     the error m of it and of that of the right ones alone."""
     solution, rows, rejected = from_known(lost(graph))

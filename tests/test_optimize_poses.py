@@ -23,7 +23,7 @@ from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import Space, exp, log
 
 
-def everything(dimension: int, noise: float = 0.05) -> tuple[Problem, np.ndarray]:
+def everything(dimension, noise=0.05):
     """Two robots of four poses each and a landmark, with one factor of every kind that exists, and the truth."""
     rng = default_rng(0)
     d, space = dimension, Space(dimension, has_rotation=True)
@@ -57,7 +57,7 @@ def everything(dimension: int, noise: float = 0.05) -> tuple[Problem, np.ndarray
     return problem, truth
 
 
-def relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
+def relative(space, truth, nodes):
     p, R = space.position(truth), space.rotation(truth)
     if len(nodes) == 1:
         return truth[nodes[0]]
@@ -99,7 +99,7 @@ def test_a_turned_world_turns_the_estimate():
     assert b.position == pytest.approx(a.position @ turn.T + shift, abs=1e-6)
 
 
-def small() -> Graph:
+def small():
     moved = PoseEdges([[0, 1], [1, 2]], [[4, 0], [0, 4]], [[0.5], [0.1]], [0.01 * np.eye(3)] * 2)
     ranges = RangeEdges([[0, 3], [1, 3], [2, 3]], [5.0, 4.1, 3.2], [0.01] * 3)
     position, turned = [[0, 0], [4, 0], [4, 4], [3, 4.1]], [[0], [0.5], [0.6], [0]]

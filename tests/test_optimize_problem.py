@@ -27,7 +27,7 @@ def recording(crossing):
     return observe(crossing, S2, V2X(max_neighbours=4, radius=60), runs=3)
 
 
-def mixed() -> Problem:
+def mixed():
     """One factor of every kind, with std per component, per row and a full root."""
     rng = default_rng(0)
     p = Problem([*"abcd"], x0=rng.normal(size=(4, 3)) * 10)

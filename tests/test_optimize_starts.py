@@ -12,9 +12,8 @@ from numpy.random import default_rng
 from random_graphs import random_drive, scipys
 from unseen_graphs import lost, ranged_drives, world
 
-from coopoc.arrays import Floats
 from coopoc.formats.graph import Graph, PoseEdges
-from coopoc.optimize import Loss, Problem, Solution, solve, solve_gnc
+from coopoc.optimize import Loss, Problem, solve, solve_gnc
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.factor import taken
@@ -25,7 +24,7 @@ from coopoc.optimize.starts.graph_starts import tree, walk
 from coopoc.optimize.starts.mirrors import ranges_of, rewound
 
 
-def flat_drive(seed: int) -> Problem:
+def flat_drive(seed):
     """A drive within 0.3 m of a plane, with three landmarks that are ranged."""
     w = world(seed, 3, 1, 60, 3, size=20.0)
     low = w.position.copy()
@@ -50,7 +49,7 @@ def test_landmarks_beside_a_plane_are_mirrored(seed):
     assert any("minimum" in note for note in found.notes) == (sorted(costs)[1] < found.cost + 10)
 
 
-def beside(graph: Graph) -> list[Solution]:
+def beside(graph):
     """From the truth, and from a start of our own to the graph without it."""
     problems = from_graph(graph, start="file"), from_graph(lost(graph))
     return [solve(problem, covariance=False) for problem in problems]
@@ -117,7 +116,7 @@ def test_exact_ranges_end_at_the_truth_without_a_word():
     assert not found.notes
 
 
-def outliers(seed: int) -> tuple[Problem, Floats, Floats]:
+def outliers(seed):
     """A network of 30 points in the plane from anywhere, with a tenth of its ranges too long; its truth, and which
     these are."""
     rng = default_rng(seed)
@@ -190,7 +189,7 @@ def test_a_walk_counts_beyond_what_32_bits_hold():
     assert np.allclose(norm(np.diff(position, axis=0), axis=1), 1.0)
 
 
-def ring(n: int, wrong: float) -> Graph:
+def ring(n, wrong):
     """A drive round a circle whose turns are `wrong` by this in all, and its closure."""
     edge, turn = np.c_[np.arange(n), np.roll(np.arange(n), -1)], (2 * pi + wrong) / n
     moved = PoseEdges(edge, np.tile([1.0, 0], (n, 1)), np.full((n, 1), turn), np.tile(0.01 * np.eye(3), (n, 1, 1)))

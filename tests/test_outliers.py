@@ -8,7 +8,7 @@ from conftest import among, refused
 from numpy import nan
 from numpy.linalg import norm
 
-from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors, observe
+from coopoc import V2X, Fault, Outliers, Sensors, observe
 from coopoc.world.links import to_vector, wrap
 from coopoc.world.sensing import episodes
 from coopoc.world.storage import read_recording, save_recording
@@ -23,7 +23,7 @@ ALL = Outliers(
 )
 
 
-def seen(fleet: Fleet, outliers: Outliers = ALL, **options: object) -> Recording:
+def seen(fleet, outliers=ALL, **options: object):
     return observe(fleet, replace(S2, outliers=outliers), V2X(max_neighbours=4), **{"runs": 3, **options})
 
 

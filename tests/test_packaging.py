@@ -15,12 +15,12 @@ WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 PINNED = re.compile(r"uses: ([\w./-]+)@([0-9a-f]{40}) # v\d+\.\d+\.\d+$")
 
 
-def pins() -> dict[str, str]:
+def pins():
     lines = (ROOT / "constraints.txt").read_text().splitlines()[1:]
     return {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
 
 
-def closure(names: list[str]) -> set[str]:
+def closure(names):
     """Distributions that these need on this machine, and they themselves."""
     found = set[str]()
     while names:

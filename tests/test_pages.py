@@ -3,7 +3,6 @@
 import os
 import re
 from itertools import zip_longest
-from pathlib import Path
 
 import pytest
 from shell import ROOT, python
@@ -17,23 +16,23 @@ FREE = ("ms", "iterations")
 """Units of numbers that differ from machine to machine."""
 
 
-def text(page: str) -> str:
+def text(page):
     return (ROOT / "README.md" if page == "README" else ROOT / "docs" / f"{page}.md").read_text()
 
 
-def blocks(page: str) -> list[tuple[str, str]]:
+def blocks(page):
     """Blocks of Python; with each the block without a language that follows it, which shows what it prints."""
     return re.findall(r"```python\n(.*?)```\n(?:\n```\n(.*?)```\n)?", text(page), flags=re.DOTALL)
 
 
-def printed(page: str, folder: Path) -> str:
+def printed(page, folder):
     (folder / "page.py").write_text("\n".join(code for code, _ in blocks(page)))
     flags = ["-W", "error", "-W", "ignore:'click.utils"]  # of a library that Flower imports
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "examples")}
     return python(*flags, "page.py", cwd=folder, env=environment)
 
 
-def agree(shown: str, found: str) -> bool:
+def agree(shown, found):
     """Words alike, whole numbers alike, decimals to 5 % or two units of their last digit; "..." is any rest."""
     here, there = shown.split(), found.split()
     for a, b, unit in zip_longest(here, there, here[1:], fillvalue=""):
@@ -47,7 +46,7 @@ def agree(shown: str, found: str) -> bool:
     return True
 
 
-def close(shown: str, found: str) -> bool:
+def close(shown, found):
     if shown.lstrip("+-").isdigit():
         return shown == found
     last = 10.0 ** -len(shown.partition("e")[0].partition(".")[2])

@@ -14,7 +14,7 @@ REFERENCE = ROOT / "studies" / "reference" / "neighbours.json"
 METHODS = (("gnss", "none"), ("lkf-sa", "identity"), ("joint", "nominal"))
 
 
-def published(most: int, method: str, noise_model: str) -> tuple[float, float]:
+def published(most, method, noise_model):
     """Mean RT-LE m of the five egos, and its standard deviation from run to run."""
     for number in json.loads(REFERENCE.read_text())["numbers"]:
         where = number["where"] | {"metric": number["metric"]}

@@ -23,7 +23,7 @@ from coopoc.study.plot import legend
 from coopoc.study.publish import views
 from coopoc.study.report import report
 from coopoc.study.run import run_study
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Study
 from coopoc.study.tables import Table
 
 
@@ -111,11 +111,11 @@ UNPRINTABLE = {"line": "a\n\n# b", "right to left": "a\u202egnp.exe", "terminal"
 ALL = NAMES | UNPRINTABLE | {"command": r"\write18{touch ran}", "letters by code": "^^5cinput"}
 
 
-def controls(text: str) -> set[str]:
+def controls(text):
     return {letter for letter in text if letter != "\n" and unicodedata.category(letter)[0] == "C"}
 
 
-def words(figure: Figure) -> str:
+def words(figure):
     """What a figure shows, from its SVG with text as text."""
     out = io.BytesIO()
     figure.savefig(out, format="svg")
@@ -153,7 +153,7 @@ def test_no_vehicle_has_a_name_that_acts_on_a_terminal(kind):
         co.Fleet((UNPRINTABLE[kind],), [0.0, 0.1], still, still)
 
 
-def cell(p: Params) -> list[Row]:
+def cell(p):
     return [{"run": run, "ego": p["name"], "rt_le_m": 1.0 + run} for run in range(2)]
 
 

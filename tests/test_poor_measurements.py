@@ -16,7 +16,6 @@ from coopoc import (
     Fleet,
     JointFilter,
     Kalman,
-    Recording,
     Sensors,
     nees,
     observe,
@@ -60,7 +59,7 @@ def test_a_drive_starts_with_a_fix(crossing):
 RUNS = 10
 
 
-def ranged() -> tuple[Fleet, Recording]:
+def ranged():
     """Three cars that range each other at every step; those beside the ego have their first fix a step later."""
     t = 0.5 * np.arange(200)
     ego = np.stack([8 * t, 3 * np.sin(0.05 * t), 0 * t], -1)

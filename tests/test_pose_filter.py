@@ -30,7 +30,7 @@ NOISE = co.Sensors(
 LATE = co.V2X(max_neighbours=3, radius=40.0, rate=5.0, loss=0.3, latency=0.2)
 
 
-def with_gaps(recording: co.Recording) -> co.Recording:
+def with_gaps(recording):
     """A third of the fixes and compasses after the first step, and of each relative component, are missing."""
     rng, body = default_rng(0), recording.body
     gnss, heading, relative = recording.gnss.copy(), body.heading.copy(), recording.relative.copy()

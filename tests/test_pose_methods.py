@@ -21,7 +21,7 @@ WHITE = co.Sensors(
 )
 
 
-def convoy(vehicles: int = 5, steps: int = 200, masts: int = 0) -> co.Fleet:
+def convoy(vehicles=5, steps=200, masts=0):
     """Vehicles that wind along at 10 m/s, 8 m apart, and masts beside their way."""
     t = np.arange(steps) * 0.1
     course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * np.arange(vehicles))
@@ -32,7 +32,7 @@ def convoy(vehicles: int = 5, steps: int = 200, masts: int = 0) -> co.Fleet:
     return with_masts(fleet, np.arange(masts)[:, None] * [60.0, 0.0, 0.0] + [0.0, 12.0, 4.0])
 
 
-def observed(fleet: co.Fleet, sensors: co.Sensors = WHITE, runs: int = 30, **more: Any) -> co.Recording:
+def observed(fleet, sensors=WHITE, runs=30, **more: Any):
     marks = [name for name in fleet.ids if name[0] == "m"]
     v2x = co.V2X(max_neighbours=more.pop("neighbours", 4), radius=60.0)
     return co.observe(fleet, sensors, v2x, runs=runs, frame="body", landmarks=marks, **more)

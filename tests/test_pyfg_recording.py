@@ -3,7 +3,6 @@
 import json
 import sys
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -73,7 +72,7 @@ def test_points_and_poses_of_others_are_counted():
     assert log.summary.refused["measured points and poses other than odometry"][0] == 13121
 
 
-def without_stamps(part: Any) -> Any:
+def without_stamps(part):
     """A graph as g2o can hold it."""
     if not is_dataclass(part):
         return part
@@ -83,7 +82,7 @@ def without_stamps(part: Any) -> Any:
     return replace(part, **changes)  # type: ignore[type-var]
 
 
-def inverted(line: str) -> str:
+def inverted(line):
     """An edge of poses in the plane with the covariance in the place of the information."""
     words = line.split()
     if words[0] == "EDGE_SE2":

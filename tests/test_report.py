@@ -16,7 +16,7 @@ VOID = {"meta", "link", "img"}
 class Page(HTMLParser):
     """Collects tags, attributes that refer to something, ids and text, and checks that tags close in order."""
 
-    def __init__(self, text: str):
+    def __init__(self, text):
         super().__init__()
         self.tags: list[str] = []
         self.open: list[str] = []
@@ -25,7 +25,7 @@ class Page(HTMLParser):
         self.text = ""
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]):
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         if tag not in VOID:
             self.open.append(tag)
@@ -36,10 +36,10 @@ class Page(HTMLParser):
             if name == "id":
                 self.ids.append(value or "")
 
-    def handle_endtag(self, tag: str):
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str):
+    def handle_data(self, data):
         self.text += data
 
 

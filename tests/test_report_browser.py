@@ -3,12 +3,10 @@
 import re
 import shutil
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from coopoc.study.report import report
-from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.tables import Table
 
@@ -17,7 +15,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
-def _numbers(results: Results) -> Table:
+def _numbers(results):
     """Numbers whose order as text is another one, what is missing, intervals, and durations."""
     wide = results.interval("rt_le_m", method="kalman", max_neighbours=0)
     narrow = results.interval("rt_le_m", method="joint", max_neighbours=2)
@@ -30,7 +28,7 @@ def _numbers(results: Results) -> Table:
     return Table(("Name", "Number", "Interval", "Duration"), rows, "Made to be sorted.")
 
 
-def _wide(results: Results) -> Table:
+def _wide(results):
     """More columns than a screen is wide."""
     found = results.interval("rt_le_m", method="kalman", max_neighbours=0)
     return Table(("Method", *(f"Column {i}" for i in range(20))), (("KF", *(found,) * 20),), "Wide.")
@@ -72,7 +70,7 @@ def page(request, browser, page_file):
     assert said == []
 
 
-def _column(page: Any, table: str, index: int) -> list[str]:
+def _column(page, table, index):
     cells = page.locator(f"#small-table-{table} tbody tr td:nth-child({index + 1})").all_inner_texts()
     return [re.split(r"\s", cell)[0] if index else cell for cell in cells]
 

@@ -11,7 +11,7 @@ from conftest import measured, winding
 from numpy.testing import assert_allclose
 
 import coopoc as co
-from coopoc import V2X, CooperativeFilter, Fleet, Kalman, Recording, Sensors, observe
+from coopoc import V2X, CooperativeFilter, Kalman, Sensors, observe
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS
 from coopoc.studies import benchmark
@@ -22,14 +22,14 @@ TURNS = AS_STATED._replace(heading=0.1, scale=0.03, lasts=300.0, absent=-np.inf)
 """Errors of heading and scale, and no guard: the rivals' extended Kalman filter."""
 
 
-def turned(recording: Recording, angle: float, scale: float) -> Recording:
+def turned(recording, angle, scale):
     """With odometry whose heading errs by `angle` rad and whose speeds by a share."""
     c, s = np.cos(angle), np.sin(angle)
     velocity = recording.velocity @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
     return replace(recording, velocity=(1 + scale) * velocity)
 
 
-def seen(steps: int = 300, runs: int = 2, **noise: Any) -> tuple[Recording, Fleet]:
+def seen(steps=300, runs=2, **noise: Any):
     """A winding drive with gaps, missing fixes and some 30 m off."""
     fleet = winding(steps, 10.0, 7.0)
     recording = observe(fleet, Sensors(**noise), V2X(max_neighbours=0), runs=runs, seed=3)

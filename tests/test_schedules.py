@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from conftest import refused, standing
 
-from coopoc import LKFSA, V2X, Fleet, JointFilter, Recording, Sensors, observe
+from coopoc import LKFSA, V2X, JointFilter, Sensors, observe
 from coopoc.world.inbox import inbox, within_cap
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 S2 = Sensors.paper_scenario2()
 
 
-def received_steps(fleet: Fleet, **given: float) -> list[int]:
+def received_steps(fleet, **given: float):
     """Steps at which the first of two vehicles receives the other's message, 32 B a message."""
     seen = observe(fleet, S2, V2X(1, **given))  # type: ignore[arg-type]
     return np.flatnonzero(inbox(seen, 0, FIX_AND_VELOCITY).arrival[0] >= 0).tolist()
@@ -61,7 +61,7 @@ def test_messages_pass_the_bucket_nearest_first(crossing):
     assert 0.2 < (found >= 0).mean() < 0.9 * (seen.arrival[:, link] >= 0).mean()
 
 
-def by_hand(seen: Recording, ego: int, size: int) -> list[set[tuple[int, int]]]:
+def by_hand(seen, ego, size):
     """(step, neighbour) that are received in each run, by the rules one message at a time."""
     runs, links = [], seen.links
     for run in range(seen.runs):

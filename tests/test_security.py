@@ -6,8 +6,6 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from conftest import refused
@@ -21,19 +19,19 @@ from coopoc.study.reference import Reference
 from coopoc.study.report import report
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Study
 from coopoc.study.tables import Table, pivot
 
 EVIL = "from pathlib import Path\nPath({mark!r}).write_text('ran')\n"
 SCRIPT = '<script>alert("1")</script>'
 
 
-def cell(p: Params) -> list[Row]:
+def cell(p):
     """Two runs of two egos, whose ids are not to be trusted."""
     return [{"run": r, "ego": e, "rt_le_m": 1.0 + r + p["x"], "text": "=1+1"} for r in range(2) for e in ("=a", "b")]
 
 
-def table(results: Results) -> Table:
+def table(results):
     """With a caption that is not to be trusted."""
     return replace(pivot(results, "x", "method", "rt_le_m"), caption=f"Caption {SCRIPT}", notes=(SCRIPT,))
 
@@ -65,11 +63,11 @@ def evil(tmp_path):
     return path, mark
 
 
-def edited(path: Path, change: Callable[[Any], Any]):
+def edited(path, change):
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
 
 
-def files(folder: Path) -> set[Path]:
+def files(folder):
     return {path for path in folder.rglob("*") if path.is_file()}
 
 

@@ -15,7 +15,7 @@ LINE = 400
 """Characters that a result may take in an interpreter."""
 
 
-def one_line(result: object) -> str:
+def one_line(result):
     """The repr of a result, checked."""
     shown = repr(result)
     assert shown.startswith(type(result).__name__), shown[:LINE]

@@ -52,7 +52,7 @@ def test_a_tutorial_runs(tutorial, tmp_path):
         says_what_it_prints(out)
 
 
-def says_what_it_prints(printed: str):
+def says_what_it_prints(printed):
     """The findings of the tutorial on the paper, from its table and its differences."""
     rows = {line[:25].strip(): [float(cell) for cell in line[25:].split()] for line in printed.splitlines()[6:21]}
     net, tuned = rows["FedKalmanNet"][0], rows["Kalman filter, fitted"][0]

@@ -6,8 +6,7 @@ from conftest import holed, refused, winding, without
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import solo as oracle
 
-from coopoc import GNSS, V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
-from coopoc.arrays import Floats
+from coopoc import GNSS, V2X, CooperativeFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import nees, rt_le
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter
@@ -34,12 +33,12 @@ def test_bad_settings_are_named(crossing):
         Kalman(NoiseModel.nominal(Sensors(velocity_floor=0.0)))(gaps(crossing))
 
 
-def gaps(fleet: Fleet, *away: tuple[slice, int]) -> Recording:
+def gaps(fleet, *away):
     """Some fixes missing everywhere, and vehicles that are away for a while."""
     return holed(observe(without(fleet, *away), S2, V2X(max_neighbours=0), runs=3), 0.4)
 
 
-def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | float, ...]:
+def series(seen, q, r, *at):
     """Fixes, velocities and variances of one axis of a vehicle, and dt."""
     run, n, c = at
     return *(part[run, :, n, c] for part in (seen.gnss, seen.velocity, q)), r[c], seen.dt

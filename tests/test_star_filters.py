@@ -21,10 +21,8 @@ from coopoc import (
     MSMV,
     V2X,
     CovarianceIntersection,
-    Fleet,
     JointFilter,
     NoiseModel,
-    Recording,
     Sensors,
     load_fleet,
     observe,
@@ -35,7 +33,6 @@ from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
-from coopoc.methods.track import Method
 from coopoc.world.links import spherical, to_vector
 
 S2 = Sensors.paper_scenario2()
@@ -50,7 +47,7 @@ CHANNELS = {
 }
 
 
-def partial(recording: Recording) -> Recording:
+def partial(recording):
     """Every third measurement a range only, others without inclination."""
     relative = recording.relative.copy()
     draw = np.random.default_rng(6).uniform(size=relative.shape[:2])
@@ -59,29 +56,29 @@ def partial(recording: Recording) -> Recording:
     return replace(recording, relative=relative)
 
 
-def gappy(fleet: Fleet) -> Fleet:
+def gappy(fleet):
     """Vehicles that appear and vanish."""
     return without(fleet, (slice(20), slice(2, 5)), (slice(40, None), slice(5, 7)))
 
 
-def known_of(method: Any, recording: Recording) -> NoiseModel:
+def known_of(method, recording):
     return resolve(method.noise_model, recording)
 
 
-def by_joint(method: JointFilter, recording: Recording, stars: Any) -> Any:
+def by_joint(method, recording, stars):
     known = known_of(method, recording)
     return joint.follow(stars, partial_of(joint.update, noise_model=known, exact=method.exact and known.exact_relative))
 
 
-def by_lkf(method: LKFSA, recording: Recording, stars: Any) -> Any:
+def by_lkf(method, recording, stars):
     return joint.follow(stars, partial_of(lkf_sa.update, noise_model=known_of(method, recording)))
 
 
-def by_msmv(method: MSMV, recording: Recording, stars: Any) -> Any:
+def by_msmv(method, recording, stars):
     return msmv.follow(stars, known_of(method, recording))
 
 
-def by_ci(method: CovarianceIntersection, recording: Recording, stars: Any) -> Any:
+def by_ci(method, recording, stars):
     return covariance_intersection.follow(stars, known_of(method, recording), method.split)
 
 
@@ -98,13 +95,13 @@ ORACLES: list[tuple[Any, Callable[..., Any]]] = [
 ]
 
 
-def label(pair: Any) -> str:
+def label(pair):
     return (
         "-".join(str(v) for v in vars(pair[0]).values() if isinstance(v, str | bool)) if isinstance(pair, tuple) else ""
     )
 
 
-def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: Recording, near: float = 1e-7):
+def assert_is_the_oracle(method, oracle, recording, near=1e-7):
     known, ego = known_of(method, recording), 0
     track, sent = method(recording, [ego]), {}
     if isinstance(method, MSMV | CovarianceIntersection):

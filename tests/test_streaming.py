@@ -11,18 +11,16 @@ import pytest
 from conftest import holed, measured, refused, textbook
 from numpy import nan
 from numpy.linalg import eigvalsh, inv, lstsq
-from numpy.random import Generator, default_rng
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles.solo import filterpys
 from shell import ROOT, ran
 
 from coopoc import V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Sensors, StarStream, observe
-from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.cooperative_filter import AS_STATED
 from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement
-from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
 FITTED = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
@@ -42,7 +40,7 @@ STARTS: dict[str, Callable[..., Any]] = {
 U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
 
 
-def play(stream: Any, recording: Recording, ego: int, run: int, first: int = 0) -> tuple[Floats, Floats]:
+def play(stream, recording, ego, run, first=0):
     """(T, 3) and (T, 3, 3) of a solo stream that is fed a run from step `first` on."""
     fixes, speeds = recording.gnss[run, first:, ego], recording.velocity[run, first:, ego]
     found = [stream.step(z, u, recording.dt) for z, u in zip(fixes, speeds, strict=True)]
@@ -117,7 +115,7 @@ def test_nothing_is_known_before_the_first_fix(name):
         assert_allclose(np.diag(cov), variance)
 
 
-def window(draw: Generator, steps: int, late: int, q: float, r: float) -> tuple[float, float, float, float]:
+def window(draw, steps, late, q, r):
     """Errors in m of a drive's end on one axis: the stream, the optimum, the stream without late fixes, and the
     optimum's own std. Odd steps bring the fix of `late` steps ago, even ones a prompt fix.
 

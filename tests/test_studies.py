@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from coopoc.study.numbers import seed_std
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
-from coopoc.study.study import Params, Study
+from coopoc.study.study import Study
 
 CLASSIC = {"method": "gnss,kalman,lkf-sa,joint,bound", "runs": 4, "egos": "2", "max_neighbours": "0,2,6"}
 
@@ -35,12 +34,12 @@ def town10():
     return co.load_fleet("town10")
 
 
-def study(name: str, **changes: object) -> Study:
+def study(name, **changes: object):
     found: Study = find("coopoc.studies", name)
     return found.override(changes)
 
 
-def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Results:
+def drawn(name, frame, *axes, **settings: object):
     """Results of a study whose rows are given: what may be said of them is known beforehand."""
     return Results(name, "", axes, {**study(name).settings, **settings}, frame, pd.DataFrame(), 0, {})
 
@@ -83,7 +82,7 @@ def test_the_bound_receives_what_the_channel_sends(rate):
     assert bound["bytes_per_second"] == pytest.approx(joint["bytes_per_second"], rel=0.1)
 
 
-def cdf(net: Sequence[float]) -> Results:
+def cdf(net):
     """The fitted KF at about 1 m, and a federated net that differs from it by a constant for each training seed."""
     both = {"scenario": 1, "velocity_ratio": 0.15, "method": "kalman", "noise_model": "fitted"}
     noise = np.random.default_rng(0).uniform(0.9, 1.1, (2, 4))
@@ -115,7 +114,7 @@ def test_a_verdict_needs_runs_and_training_seeds(net, words):
     assert re.match(r"Scenario 1: federated [\d.]+ m, fitted KF [\d.]+ m; the federated net ", text)
 
 
-def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:
+def plant(folder, name, p, rounds=2):
     """The shipped weights of a method as the first seed's checkpoint of a training that these parameters ask for."""
     shipped = load(WEIGHTS / f"{name}.safetensors")
     drives = co.load_fleet(str(p["clients"]))

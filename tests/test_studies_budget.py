@@ -13,7 +13,6 @@ from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of
 from coopoc.studies import budget as study
 from coopoc.studies import scene
 from coopoc.study import numbers
-from coopoc.study.tables import Table
 from coopoc.world.channels import CHANNELS
 from coopoc.world.sensing import find_links
 
@@ -46,12 +45,12 @@ def tight(tmp_path_factory, short_town):
     return run_study("budget", tmp_path_factory.mktemp("tight"), settings=wanted)
 
 
-def rows(table: Table | None) -> list[tuple[object, ...]]:
+def rows(table):
     assert table is not None
     return list(table.rows)
 
 
-def at(**where: object) -> dict[str, object]:
+def at(**where: object):
     return {"max_neighbours": 2, **study.IDEAL_CHANNEL, "method": "joint", "noise_model": "nominal", **where}
 
 

@@ -60,7 +60,7 @@ TINY = {
 }
 
 
-def given(**more: Any) -> dict[str, Any]:
+def given(**more: Any):
     """Parameters of a tiny cell."""
     return {**aggregation.STUDY.settings, **TINY, "condition": "iid", "method": "mean", "scenario": 1, **more}
 

@@ -2,8 +2,6 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from coopoc.studies import scene
 from coopoc.study import numbers
 
 
-def conditions(file: Path) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], dict[str, Any]]]]:
+def conditions(file):
     """Every condition of a study with the marks of its methods and bounds."""
     found: dict[str, dict[tuple[str, str], dict[str, Any]]] = defaultdict(dict)
     for number in json.loads(file.read_text())["numbers"]:

@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -173,7 +172,7 @@ def test_every_line_that_coincides_is_named(results):
     assert first.get_text() == "KF\nidentity = FedKalmanNet\nfitted = OKF"
 
 
-def from_reference(file: Path) -> Results:
+def from_reference(file):
     """Results whose means and spread over runs are the committed ones: two egos that are alike, eight runs, errors of
     one law, a tenth more before training."""
     known = json.loads(file.read_text())

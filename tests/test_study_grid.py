@@ -17,12 +17,12 @@ from coopoc.study.study import Study, digest
 from coopoc.study.tables import pivot
 
 
-def study(**changes: object) -> Study:
+def study(**changes: object):
     options = {"grid": {"k": np.arange(2), "method": ("a", "b")}, "settings": {"runs": 3, "egos": (0, 1), "ratio": 0.1}}
     return Study(**{"name": "s", "question": "?", "cell": dict, **options, **changes})  # type: ignore[arg-type]
 
 
-def names(**changes: object) -> list[str]:
+def names(**changes: object):
     return [cell.name for cell in study(**changes).cells()]
 
 
@@ -204,11 +204,11 @@ def test_bundled_cells_count_by_what_they_run():
     assert codes["robustness"] == codes["latency_loss"] != codes["real"]
 
 
-def computed(p: object) -> list[dict[str, object]]:
+def computed(p):
     raise AssertionError("a cell was computed before the views were checked")
 
 
-def demo(view: object) -> Study:
+def demo(view):
     return Study("demo", "?", computed, {"noise_model": ("nominal",), "x": (1,)}, tables={"a": view})  # type: ignore[dict-item]
 
 

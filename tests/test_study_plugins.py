@@ -1,7 +1,6 @@
 """Entry points: names, mappings, clashes, and distributions that are broken."""
 
 from importlib import metadata
-from pathlib import Path
 
 import pytest
 from conftest import refused
@@ -10,7 +9,7 @@ from shell import python
 from coopoc import plugins
 
 
-def install(folder: Path, name: str, points: str):
+def install(folder, name, points):
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +10,8 @@ from conftest import refused
 
 from coopoc.plugins import find, names
 from coopoc.study.reference import Reference, check, measure, table
-from coopoc.study.results import Results
 from coopoc.study.run import run_study
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Study
 
 CHEAP: Mapping[str, dict[str, Any]] = {
     "correlated_gnss": {"method": "kalman", "max_neighbours": "0", "own_share": "0.5"},
@@ -32,7 +30,7 @@ AS_RUN = ("weights", "metric")
 """Settings that do not change the numbers."""
 
 
-def cell(p: Params) -> list[Row]:
+def cell(p):
     """Two egos, three runs: known means and deviations."""
     return [
         {"run": r, "ego": ego, "rt_le_m": p["x"] * p["scale"] * (1 + 0.1 * r), "nees": 3.0 + p["shift"]}
@@ -50,11 +48,11 @@ def results(tmp_path):
     return run_study(STUDY, tmp_path)
 
 
-def verdicts(now: Results, known: Reference) -> dict[tuple[float, str], str]:
+def verdicts(now, known):
     return {(c.was.where["x"], c.was.metric): c.verdict for c in check(now, known, METRICS)}
 
 
-def changed(tmp_path: Path, **settings: float) -> Results:
+def changed(tmp_path, **settings: float):
     """Rows of other settings, as if the code had changed under the same ones."""
     now = run_study(STUDY, tmp_path / "now", settings=settings)
     return replace(now, settings={**STUDY.settings, "runs": now.settings["runs"]})

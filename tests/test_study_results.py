@@ -17,7 +17,7 @@ from coopoc.study.style import look
 from coopoc.study.tables import FORMATS, Table, pivot
 
 
-def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "noise_model", "k")) -> Results:
+def results(frame, axes=("method", "noise_model", "k")):
     return Results("demo", "?", axes, {}, frame, pd.DataFrame(), 0, {})
 
 

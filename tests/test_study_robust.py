@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,7 +75,7 @@ def test_two_runners_that_start_together(study, tmp_path):
     assert plan(study, tmp_path)["finished"] == 9
 
 
-def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
+def in_a_small_disk(script, tmp_path):
     """Lines of a script that runs where `disk` is a file system of its own, which goes with the script."""
     if not shutil.which("unshare"):
         pytest.skip("util-linux is not installed")

@@ -5,7 +5,6 @@ import math
 import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ import coopoc as co
 from coopoc.cli import _status
 from coopoc.studies import benchmark, worlds_card
 from coopoc.studies.world_faults import KINDS
-from coopoc.studies.worlds import SPLITS, World, world
+from coopoc.studies.worlds import SPLITS, world
 
 CHANGES = {
     "noise levels": {"fixes of egos", "fixes of others", "velocities", "range", "azimuth", "inclination"},
@@ -55,17 +54,17 @@ CHANGES = {
 
 
 @lru_cache
-def drawn() -> tuple[World, ...]:
+def drawn():
     return tuple(world(seed) for seed in range(300))
 
 
-def with_kind(kind: str) -> list[World]:
+def with_kind(kind):
     found = [one for one in drawn() if kind in one.kinds]
     assert found, kind
     return found
 
 
-def parts(one: World) -> dict[str, Any]:
+def parts(one):
     """What methods see, in parts; those of links are None where the links themselves may differ."""
     seen = one.recording
     others = np.setdiff1d([k for k, name in enumerate(seen.ids) if not name.startswith("ghost")], one.egos)
@@ -83,7 +82,7 @@ def parts(one: World) -> dict[str, Any]:
     }
 
 
-def different(one: World, other: World) -> set[str]:
+def different(one, other):
     first, second = parts(one), parts(other)
     of_links = {"range", "azimuth", "inclination", "messages"}
     same_links = np.array_equal(first["members"], second["members"])

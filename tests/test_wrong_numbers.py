@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused, winding, without
-from filterpy.kalman import KalmanFilter
 from numpy import pi
 from numpy.linalg import norm, solve
 from numpy.random import default_rng
@@ -22,8 +21,8 @@ from numpy.testing import assert_allclose
 from oracles.solo import filterpys
 
 import coopoc as co
-from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
-from coopoc.arrays import Floats, Ints
+from coopoc import V2X, CooperativeFilter, Kalman, Sensors, load_fleet, observe
+from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import innovation_columns
 from coopoc.evaluate.scores import causal, scored
 from coopoc.kernels import gate
@@ -65,7 +64,7 @@ def links(recording):
     return default_rng(0).choice(held, RUNS)
 
 
-def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
+def damaged(recording, kind, links):
     """One wrong number in each run, of 1 to 1e6 m in a random direction; of an angle anything."""
     rng, run = default_rng(1), np.arange(RUNS)
     size, way = SIZES, rng.normal(size=(RUNS, 3))
@@ -102,7 +101,7 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(name, 
     assert (farthest < once) == robust
 
 
-def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Floats]:
+def estimates(recording, kind, links):
     """Position (R, T, 3) m of the cooperative filter and its std (R, T) m, a wrong number in each run. "position",
     "odometer" and "velocity" are those of a message."""
     method, run, of = CooperativeFilter(), np.arange(RUNS), recording.links
@@ -145,7 +144,7 @@ def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_d
     assert first == 0 or kind not in KINDS or later[SIZES > FAR].max() < BEYOND
 
 
-def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
+def wild_fixes(steps):
     """A vehicle of whose fixes 15 % are 3 m to 10 km off on each axis, its motion's variances, and filterpy's filter at
     the first fix."""
     drive = observe(winding(steps, 10.0, 7.0), S2, V2X(0), seed=2)
@@ -217,7 +216,7 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances():
 S = co.Sensors(min_range=0.0)
 
 
-def drive(gap: tuple[float, float, float] = (9.0, 0.0, 0.0), steps: int = 80) -> co.Fleet:
+def drive(gap=(9.0, 0.0, 0.0), steps=80):
     """Two vehicles on a bend, the second `gap` m from the first."""
     t = 0.1 * np.arange(steps)
     velocity = np.c_[5 * np.cos(0.2 * t), 5 * np.sin(0.2 * t), 0 * t]
@@ -258,11 +257,11 @@ class Changed(co.Kalman):
     name: str = "negative"
     change: Callable[..., Any] = replace
 
-    def __call__(self, recording: co.Recording, egos: Any = (0,)) -> Any:
+    def __call__(self, recording, egos=(0,)):
         return self.change(super().__call__(recording, egos))
 
 
-def negative(track: co.Track, share: float = 0.0) -> co.Track:
+def negative(track, share=0.0):
     """With another covariance from the fifth step on."""
     covariance = np.array(track.covariance)
     covariance[:, 5:] = np.eye(3) + share * np.eye(3, k=1) if share else -np.eye(3)
@@ -339,7 +338,7 @@ def test_plausible_limits_hold_where_a_noun_is_made():
             replace(FLEET, ids=("a", name))
 
 
-def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
+def header(shape, dtype="<f8"):
     """An array of that shape by its header, without its numbers."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})

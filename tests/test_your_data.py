@@ -14,7 +14,7 @@ from coopoc.data.log.units import KINDS
 PAGE = (ROOT / "docs" / "your_data.md").read_text()
 
 
-def blocks(language: str) -> list[str]:
+def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
