@@ -251,3 +251,12 @@ def test_an_antenna_stands_at_the_end_of_its_arm():
     x = np.stack([pose(at, turn.as_rotvec()), pose(arm, np.zeros(3))])
     problem = Problem(("car", "arm"), x0=x, poses=["car"]).add("antenna", ("car", "arm"), np.zeros(3), std=1.0)
     assert problem.whiten(x)[0] == pytest.approx(at + turn.apply(arm))
+
+
+@pytest.mark.parametrize("kind", ["relative_pose", "relative_pose_chordal"])
+def test_a_straight_chain_that_turns_about_a_landmark_is_free(kind):
+    """Closed form: ranges to one point fix no turn about it; derivatives of sin(0), 1e-17, are none."""
+    problem = Problem([*"abL"], dimension=2, poses=(0, 1)).add("position", "L", [1.0, 5.0], std=0.1)
+    problem = problem.add(kind, ("a", "b"), pose([1.0, 0.0]), std=0.1)
+    found = solve(problem.add("range", [("a", "L"), ("b", "L")], [1.4, 1.0], std=0.1), throw=False)
+    assert found.unobservable == ("a", "b")

@@ -108,6 +108,8 @@ BAD = {
     "shape of std": (lambda: PAIR.add("spherical", AB, [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
     "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.ones((2, 3))), "square matrices"),
     "std of a turn": (lambda: PAIR.add("azimuth", AB, 0.1, std=4.0), "<= pi rad"),
+    "another shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.eye(2)), "cov of position"),
+    "bound in degrees": (lambda: PAIR.constrain("azimuth", AB, 45.0), "deg2rad"),
     "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
     "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[inf]]), "must be finite"),
     "heights in a plane": (
@@ -126,6 +128,8 @@ BAD = {
         "is not quadratic",
     ),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
+    "columns of nodes": (lambda: PAIR.add("displacement", np.ones((2, 4), int), np.ones(3), std=1.0), "must name 2"),
+    "a mask": (lambda: Problem([*"ab"], fixed=[True, False]), "node = True"),
     "whole numbers for names": (lambda: Problem((2, 1)), r"names = .2, 1.: must be a sequence of texts"),
     "twice a name": (lambda: Problem([*"baa"]), r"\['a'\]: must be unique"),
     "x0": (lambda: Problem(AB, x0=np.zeros((3, 3))), "shape"),

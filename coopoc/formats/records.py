@@ -163,7 +163,8 @@ class Grammar:
             record = self.records.get(tag)
             if record is None:
                 kinds = [*self.records, *self.others]
-                hint = suggestion(tag, kinds, "Remove or convert the line.")
+                toro = "Convert the file: TORO orders information otherwise."
+                hint = toro if tag[:-1] in ("VERTEX", "EDGE") else suggestion(tag, kinds, "Remove or convert the line.")
                 raise InputError(location, tag, f"must be one of {', '.join(kinds)}", hint)
             if record.dimension and not dimension:
                 dimension, since = record.dimension, f"line {number}, {tag}"

@@ -90,7 +90,7 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> "NoiseModel":
         """The standard deviations of `sensors`, process noise from the measured pace; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        return _nominal(cls, instance("sensors", sensors, Sensors))
+        return _nominal(instance("sensors", sensors, Sensors))
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> "NoiseModel":
@@ -239,11 +239,11 @@ def _held_out(make: type[NoiseModel], recording: Recording, fleet: Fleet) -> tup
 
 
 @lru_cache(maxsize=32)  # to build and to check it takes a quarter of a short drive's time
-def _nominal(make: type[NoiseModel], sensors: Sensors) -> NoiseModel:
+def _nominal(sensors: Sensors) -> NoiseModel:
     sensors = sensors.check_assumed().assumable()
     compass = sensors.heading_std, sensors.heading_bias_std
     sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
-    return make("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
+    return NoiseModel("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording | None, relative: bool = True) -> NoiseModel:

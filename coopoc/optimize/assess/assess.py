@@ -27,6 +27,8 @@ INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
 CANCELLED = 1e-7
 """Share of its terms that a row may keep along a direction that it does not see."""
+ROUNDED = 1e-14
+"""Share of the largest number of a column up to which another is rounding, such as sin(0)."""
 DENSE_COLUMNS = 200
 """Columns up to which the null space of J is that of a dense matrix."""
 SLACK = 1e-6
@@ -250,9 +252,12 @@ def _unobservable(
 
 
 def _evened(J: Any) -> Any:
-    """Rows of J (sparse) over their largest number: their weights hide no direction."""
+    """Rows of J (sparse) over their largest number: their weights hide no direction; of numbers that are no rounding
+    beside the largest of their column."""
     from scipy.sparse import diags_array
 
+    least, J = ROUNDED * abs(J).sum(0), J.tocoo()
+    J.data *= abs(J.data) > least[J.col]
     return diags_array(1.0 / np.maximum(abs(J).max(1).toarray().ravel(), 1e-300)) @ J
 
 

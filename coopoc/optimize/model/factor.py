@@ -11,7 +11,20 @@ import numpy as np
 from numpy.linalg import cholesky, det, eigvalsh, inv, matrix_rank, norm
 from numpy.typing import ArrayLike
 
-from ...arrays import AnyArray, Bools, Floats, Ints, checked, frozen, instance, number, one_of, refuse, remade
+from ...arrays import (
+    TWO_TURNS,
+    AnyArray,
+    Bools,
+    Floats,
+    Ints,
+    checked,
+    frozen,
+    instance,
+    number,
+    one_of,
+    refuse,
+    remade,
+)
 from ...errors import InputError
 from .measurements import Measurement, lookup
 
@@ -102,8 +115,7 @@ def check_values(measurement: Measurement, z: ArrayLike, count: int) -> Floats:
             hint = "Coincident vehicles have no direction: drop the pair."
             refuse(field, column, column <= 0, "must be a distance > 0 m", hint)
         if component == "angle":
-            hint = "This looks like degrees: use np.deg2rad."
-            refuse(field, column, abs(column) > 2 * np.pi, "must be within 2 pi rad", hint)
+            refuse(field, column, abs(column) > 2 * np.pi, "must be within 2 pi rad", DEGREES)
     return array
 
 
@@ -132,14 +144,14 @@ def check_std(measurement: Measurement, std: ArrayLike | float, shape: tuple[int
     return frozen(wide)
 
 
-def check_root(measurement: Measurement, root: ArrayLike, shape: tuple[int, int]) -> Floats:
-    """sqrt_information as (M or 1, size, size), finite."""
-    array, size = checked("sqrt_information", root), shape[-1]
+def check_root(field: str, root: ArrayLike, shape: tuple[int, int]) -> Floats:
+    """cov, or sqrt_information, as (M or 1, size, size), finite."""
+    array, size = checked(field, root), shape[-1]
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.shape[1:] != (size, size) or len(array) not in (1, shape[0]):
         allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"
-        raise InputError(f"sqrt_information of {measurement.name}", array.shape, allowed, "W with W^T W = cov^-1.")
-    refuse("sqrt_information", array, ~np.isfinite(array), "must be finite", "Invert a positive definite covariance.")
+        raise InputError(field, array.shape, allowed, "Give one matrix, or one for each measurement.")
+    refuse(field, array, ~np.isfinite(array), "must be finite", "Invert a positive definite covariance.")
     return frozen(array)
 
 
@@ -155,6 +167,7 @@ LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, floa
 }
 """rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
 
+DEGREES = "This looks like degrees: use np.deg2rad."
 DEPENDENT_VOLUME = 1e-12
 """Volume of the rows of W, as a share of that of rows at right angles, up to which some may be of no rank."""
 
@@ -245,9 +258,9 @@ class Factor:
         if self.std is not None:
             self.__dict__["std"] = check_std(measurement, self.std, shape)
         else:
-            root = whitening(measurement.name, cov) if cov is not None else self.sqrt_information
-            assert root is not None
-            self.__dict__["sqrt_information"] = check_root(measurement, root, shape)
+            root = self.sqrt_information if cov is None else whitening(measurement.name, cov)
+            field = f"{stds[0]} of {measurement.name}"
+            self.__dict__["sqrt_information"] = check_root(field, root, shape)  # type: ignore[arg-type]
         if self.loss is not None:
             instance("loss", self.loss, Loss, 'Give Loss("huber", 2.0), or None.')
 
@@ -411,6 +424,8 @@ class Constraint:
             except ValueError:
                 allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
                 raise InputError(name, side.shape, allowed, "Give one bound per component.") from None
+            beyond = measurement.angles(self.dimension or 3) & np.isfinite(side) & (abs(side) > TWO_TURNS)
+            refuse(f"{name} bound of {self.kind}", self.__dict__[name], beyond, "must be within 4 pi rad", DEGREES)
         wrong = ~(self.lower <= self.upper) | ((self.lower == self.upper) & ~bounded(self))  # of NaN, too
         allowed = "must be at most the upper one, and below infinity: lower <= upper"
         refuse(f"lower bound of {self.kind}", self.lower, wrong, allowed, "No point can satisfy it.")

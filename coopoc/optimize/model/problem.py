@@ -305,11 +305,13 @@ _space = cache(Space)
 
 def indices(index: Callable[[Any], int], kind: str, nodes: Any) -> Ints:
     """Nodes (M, arity) of a kind from one node, a tuple or rows of them, each found by `index`."""
-    arity = lookup(kind).arity
-    flat = [node for row in several(nodes) for node in several(row)]
-    if len(flat) % arity or not flat:
-        raise InputError("nodes", nodes, f"must name {arity} points per {kind}", "Give points by name or index.")
-    return np.array([index(p) for p in flat]).reshape(-1, arity)
+    arity, rows = lookup(kind).arity, [several(row) for row in several(nodes)]
+    if len(rows) == arity > 1 and all(len(row) == 1 for row in rows):  # of one measurement
+        rows = [[node for row in rows for node in row]]
+    if not rows or any(len(row) != arity for row in rows):
+        hint = "Give one row of names or indices for each measurement."
+        raise InputError("nodes", shown(nodes), f"must name {arity} points per {kind}", hint)
+    return np.array([[index(node) for node in row] for row in rows])
 
 
 def several(nodes: Any) -> list[Any]:
@@ -331,7 +333,7 @@ def rows(kind: str, z: ArrayLike, count: int) -> Floats:
 def index_of(node: Any, index_of_name: Mapping[str, int], names: Sequence[str]) -> int:
     """Index of a node given by name, which has a place, or index; InputError if there is none."""
     index = index_of_name.get(node) if isinstance(node, str) else node
-    if not isinstance(index, int | np.integer) or not 0 <= index < len(names):
+    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(names):
         raise no_such_node(node, names)
     return int(index)
 
