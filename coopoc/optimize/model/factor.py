@@ -66,36 +66,6 @@ def fitting(measurement: Measurement, width: int) -> int | None:
     return fits[0] if len(fits) == 1 else None
 
 
-def check_nodes(measurement: Measurement, nodes: ArrayLike) -> Ints:
-    """(M, arity) whole numbers, no node paired with itself."""
-    array = checked("nodes", nodes, dtype=int)
-    if array.ndim != 2 or array.shape[1] != measurement.arity:
-        hint = "Give one row per measurement."
-        raise InputError("nodes", array.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
-    refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
-    ordered = np.sort(array)
-    if (same := (ordered[:, 1:] == ordered[:, :-1]).any(1)).any():
-        hint = "A vehicle does not measure itself."
-        raise InputError("nodes", array[same][0].tolist(), "must be different points", hint)
-    return array
-
-
-def check_constants(measurement: Measurement, constants: ArrayLike | None, count: int) -> Floats:
-    """(M, c) finite numbers, as many as the kind has."""
-    values = checked(f"constants of {measurement.name}", [] if constants is None else constants)
-    fits = (
-        values.ndim in (1, 2)
-        and values.shape[-1] == measurement.constants
-        and values.size in (measurement.constants, count * measurement.constants)
-    )
-    if not fits or not np.isfinite(values).all():
-        hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
-        raise InputError(
-            "constants", values.tolist(), f"must be {measurement.constants} finite numbers for {measurement.name}", hint
-        )
-    return frozen(np.full((count, measurement.constants), values))
-
-
 def check_values(measurement: Measurement, z: ArrayLike, count: int) -> Floats:
     """z as (M, k): finite, distances > 0, angles in radians, rotations that are some."""
     field = f"z of {measurement.name}"
@@ -308,10 +278,23 @@ class Factor:
 
 def _checked(item: "Factor | Constraint") -> Measurement:
     """The measurement of an item, with its name, nodes and constants checked."""
-    measurement = item.measurement
-    nodes = check_nodes(measurement, item.nodes)
-    constants = check_constants(measurement, item.constants, len(nodes))
-    item.__dict__.update(kind=measurement.name, nodes=nodes, constants=constants)
+    measurement, nodes = item.measurement, checked("nodes", item.nodes, dtype=int)
+    if nodes.ndim != 2 or nodes.shape[1] != measurement.arity:
+        hint = "Give one row per measurement."
+        raise InputError("nodes", nodes.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
+    refuse("nodes", nodes, nodes < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
+    ordered = np.sort(nodes)
+    if (same := (ordered[:, 1:] == ordered[:, :-1]).any(1)).any():
+        hint = "A vehicle does not measure itself."
+        raise InputError("nodes", nodes[same][0].tolist(), "must be different points", hint)
+    constants = checked(f"constants of {measurement.name}", [] if item.constants is None else item.constants)
+    count, own = len(nodes), measurement.constants
+    fits = constants.ndim in (1, 2) and constants.shape[-1] == own and constants.size in (own, count * own)
+    if not fits or not np.isfinite(constants).all():
+        hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
+        raise InputError("constants", constants.tolist(), f"must be {own} finite numbers for {measurement.name}", hint)
+    wide = frozen(np.full((count, own), constants))
+    item.__dict__.update(kind=measurement.name, nodes=nodes, constants=wide)
     return measurement
 
 
