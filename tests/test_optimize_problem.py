@@ -109,6 +109,7 @@ BAD = {
     "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.ones((2, 3))), "square matrices"),
     "std of a turn": (lambda: PAIR.add("azimuth", AB, 0.1, std=4.0), "<= pi rad"),
     "another shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.eye(2)), "cov of position"),
+    "variance in degrees": (lambda: PAIR.add("azimuth", AB, 1.0, cov=[[16.0]]), "<= pi rad"),
     "bound in degrees": (lambda: PAIR.constrain("azimuth", AB, 45.0), "deg2rad"),
     "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
     "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[inf]]), "must be finite"),

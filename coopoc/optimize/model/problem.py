@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike
 from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade, texts
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise
-from .factor import Constraint, Factor, check_rotations, stacked, taken, unchecked
+from .factor import Constraint, Factor, check_rotations, check_std, stacked, taken, unchecked
 from .measurements import lookup
 from .space import Space
 from .window import Noise, window
 
 if TYPE_CHECKING:
     from ...world.recording import Recording
-    from .factor import Loss
+    from .factor import Loss, check_std
 
 DERIVED = (
     ("_place", {"names"}),
@@ -183,6 +183,8 @@ class Problem:
             loss=loss,
             cov=cov,
         )
+        if cov is not None:
+            check_std(factor.measurement, np.sqrt(np.diagonal(np.asarray(cov), 0, -2, -1)), (len(index), factor.size))
         # it alone is checked: what was checked and found before is kept
         self._check(factor)
         return self.replace_unchecked(factors=(*self.factors, factor))
