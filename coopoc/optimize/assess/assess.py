@@ -14,7 +14,7 @@ from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
 from ..algebra.sparse import Entries, shared_layout, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
-from ..model.factor import Factor, as_factor, reweighed, unchecked
+from ..model.factor import Factor, as_factor, reweighed, stacked, unchecked
 from ..model.problem import Problem, linearised, several
 from .active import Active, active_at
 
@@ -42,6 +42,8 @@ TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
 DOUBTFUL_SHARE = 0.25
 """Share of measurements whose rejection casts doubt on the minimum."""
+PROBES = 4
+"""Random signs by which a trace is estimated."""
 INLIER_WEIGHT = 0.5
 """Weight rho' below which a robust loss rejects a measurement."""
 
@@ -60,6 +62,7 @@ class Assessment:
         predicted: decrease of the cost by this step, as its model predicts; infinite where constraints hold it.
         curved: J^T J hardly sees some direction, and the exact Hessian, which does, stands in for it.
         newton: the step is Newton's, by an exact Hessian that is positive definite.
+        leverage: of the rows that weigh rotations twice; 0, its least, where it is not computed.
     """
 
     cost: float
@@ -71,6 +74,7 @@ class Assessment:
     predicted: float = inf
     curved: bool = False
     newton: bool = False
+    leverage: float = 0.0
 
     @property
     def violation(self) -> float:
@@ -123,12 +127,14 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
 
     def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
         far = float(abs(dx).max(initial=0.0))
-        return Assessment(cost, size, cov, far, predicted=0.5 * abs(float(gradient @ dx)), curved=curved)
+        return Assessment(
+            cost, size, cov, far, leverage=leverage, predicted=0.5 * abs(float(gradient @ dx)), curved=curved
+        )
 
     own, cov = _largest(problem, entries, values[entries.diagonal]), none
-    step = variance = np.full(entries.size, inf)
+    step, leverage = (variance := np.full(entries.size, inf)), 0.0
     if held := cholesky.factor(values):
-        step, variance = cholesky.solve(gradient), 1.0 / cholesky.pivots
+        step, variance, leverage = cholesky.solve(gradient), 1.0 / cholesky.pivots, _leverage(problem, x)
         if not quick and (covariance or not (variance * own < INFLATION).all()):
             cov, variance = _inverse(problem, x, "gauss-newton")
         if (variance * own < INFLATION).all():
@@ -375,9 +381,9 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
             spent += 0.5 * float(factor.loss.cost(square[beyond]).sum())
             rejected.append((f"{factor.loss.name} loss", count, len(square), f"measurements {factor.kind}"))
             out += int(factor.measured[beyond].sum())
-    mean, variance = expected(problem, unknowns + out)
+    mean, variance = expected(problem, unknowns + out, truth.leverage)
     notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
-    most, spread = expected(problem, out) if pushing else (mean, variance)
+    most, spread = expected(problem, out, truth.leverage) if pushing else (mean, variance)
     if implausible(truth.cost - spent, most, spread):
         convex = not problem.movable.any() or (
             problem.linear and all(c.measurement.linear for c in problem.constraints)
@@ -434,11 +440,12 @@ def implausible(cost: float, mean: float, variance: float) -> bool:
     return bool(gammaincc(mean / scale, cost / scale) < TAIL)
 
 
-def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
+def expected(problem: Problem, unknowns: int, leverage: float = inf) -> tuple[float, float]:
     """Mean and variance of the cost at its minimum under the noise that it assumes.
 
     Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation matrix count as the
-    angles that they hold; an angle of the plane that is weighed twice adds 1 and 2.
+    angles that they hold. Those of the plane that weigh twice add 1/2 and 3/2 more but for their `leverage`, one a
+    pose at most: the mean is 1/2 tr((I - P) S), P = J (J^T J)^-1 J^T, S the covariance of whitened residuals.
     """
     d, angles, count, matrices = problem.dimension, problem.space.angles, 0, 0
     for factor in problem.factors:
@@ -449,9 +456,20 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
             matrices += int(np.count_nonzero(turned)) * factor.twice
         count += int(measured.sum())
     spare = count - unknowns
-    turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices else 0
-    mean = 0.5 * (max(spare, 0) + max(turns, 0))
-    return mean, mean + max(turns, 0)
+    turns = max(matrices - min(leverage, len({*problem.poses} - {*problem.fixed})), 0.0)
+    mean = 0.5 * (max(spare, 0) + turns)
+    return mean, mean + turns
+
+
+def _leverage(problem: Problem, x: Floats) -> float:
+    """tr(J_t H^-1 J_t^T) of the rows that weigh twice, H factored last, by Hutchinson's estimator: to a third of the
+    standard deviation of the cost."""
+    if not any(f.twice for f in problem.factors):
+        return 0.0
+    turns = stacked(np.tile(f.twice & (np.arange(f.size) >= problem.dimension), len(f.nodes)) for f in problem.factors)
+    signs = turns * np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, len(turns)))
+    probes = (linearised(problem, x)[1].T @ signs.T)[problem.movable.ravel()]
+    return float(np.sum(probes * columns_solved(sparse(problem).cholesky, probes)) / PROBES)
 
 
 def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str | int]) -> Floats:
