@@ -389,3 +389,15 @@ def test_vehicles_between_kerbs_end_as_low_as_from_the_truth(loss):
     least, far = solve(replace(problem, x0=truth)).cost, solve(replace(problem, x0=rng.normal(size=(6, 2))))
     assert max(solve(problem).cost, far.cost) < 1.0001 * least
     assert any("another minimum" in note for note in far.notes)
+
+
+def test_a_shift_of_the_world_by_5000_km_changes_no_step():
+    for seed in range(15):
+        at, z = default_rng(seed).normal(size=(2, 2, 2)) * [[[10]], [[1]]]
+        ends = []
+        for shift in (0.0, 5e6):
+            problem = Problem(AB, dimension=2).add("position", [*AB], at + z + shift, std=1.0)
+            problem = problem.constrain("position", "a", at[0] + shift - 0.1, at[0] + shift + 0.1)
+            ends.append(solve(problem.constrain("range", AB, upper=norm(at[0] - at[1]) - 0.5)))
+        assert ends[1].x - 5e6 == pytest.approx(ends[0].x, abs=1e-7)
+        assert ends[1].iterations <= ends[0].iterations + 2

@@ -15,8 +15,8 @@ from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, Capabilities, SolverResult
-from ..model.derivatives import Structure, expressions, numbers_of
-from ..model.factor import as_factor, stacked, steerable
+from ..model.derivatives import Structure, expressions, linearise, numbers_of
+from ..model.factor import as_factor, steerable, unchecked
 from ..model.problem import Problem
 
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
@@ -57,8 +57,8 @@ def solver(
     >>> solve(problem.constrain("range", ("a", "b"), upper=7.0), "casadi").x.round(3)[:, 0]
     array([1., 8.])
     """
-    form, sides = structure_of(problem), _sides(problem)
-    equal, moving = int((sides[0] == sides[1]).sum()), int(form.movable.sum())
+    form, (_, lower, upper) = structure_of(problem), _numbers(problem, x)
+    equal, moving = int((lower == upper).sum()), int(form.movable.sum())
     if equal > moving:
         raise InputError(
             "constraints",
@@ -70,7 +70,8 @@ def solver(
     space, free, count = form.space, form.movable, 0
     multipliers = 0.0
     for _ in range(10):  # for poses again around the answer until it stays
-        end = nlp(p=_numbers(problem, x), lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
+        numbers, lower, upper = _numbers(problem, x)
+        end = nlp(p=numbers, lbg=lower, ubg=upper, lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
         status = stats["return_status"]
         before, step, count = x, np.zeros(free.shape), count + int(stats["iter_count"])
@@ -82,19 +83,22 @@ def solver(
     return SolverResult(x, count, status == HOPELESS[0], {"return_status": status})
 
 
-def _numbers(problem: Problem, x: Floats) -> Floats:
-    """Parameters around x (n, ambient): x, numbers of the factors and constraints, and last by what the cost is
-    multiplied: 1 / max diag J^T J."""
+def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """Parameters around x (n, ambient), and lower and upper sides of the numbers that are bounded and can change.
+
+    Parameters are x, numbers of the factors and constraints, and last by what the cost is multiplied: 1 / max diag
+    J^T J. What is no angle counts from its value at x, so that far from the origin its digits are those of a step.
+    """
     system = sparse(problem)
     curvature = system.quadratic(x, "gauss-newton")[2][system.entries.diagonal].max(initial=1e-12)
-    parts = [x.T, *system.numbers, *(numbers_of(as_factor(c)) for c in problem.constraints)]
-    return np.concatenate([*(part.ravel() for part in parts), [1.0 / curvature]])
-
-
-def _sides(problem: Problem) -> tuple[Floats, Floats]:
-    """Lower and upper sides of the numbers that are bounded and can change."""
-    kept = [(c, c.middle, steerable(c, problem.movable)) for c in problem.constraints]
-    return stacked((c.lower - m)[which] for c, m, which in kept), stacked((c.upper - m)[which] for c, m, which in kept)
+    parts, sides = [x.T, *system.numbers], [np.empty((2, 0))]
+    for c in problem.constraints:
+        item = as_factor(c)
+        (value,) = linearise(problem.space, [item], None, x).residual
+        item = unchecked(item, z=item.z + value * ~c.measurement.angles(problem.dimension))
+        parts.append(numbers_of(item))
+        sides.append((np.stack([c.lower, c.upper]) - item.z)[:, steerable(c, problem.movable)])
+    return np.concatenate([*(part.ravel() for part in parts), [1.0 / curvature]]), *np.hstack(sides)
 
 
 def _exponential(step: Floats, dimension: int) -> Floats:

@@ -122,12 +122,14 @@ def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
     arity, (z_width, constants, _) = measurement.arity, kind.widths
     nodes, steps = ca.SX.sym("nodes", arity * space.ambient), ca.SX.sym("steps", arity * space.dof)
     number = ca.SX.sym("number", sum(kind.widths))
-    all_nodes, all_steps, numbers = (ca.vertsplit(each) for each in (nodes, steps, number))
-    places = [
-        _moved(space, all_nodes[k * space.ambient :][: space.ambient], all_steps[k * space.dof :][: space.dof])
-        for k in range(arity)
-    ]
+    numbers, d = ca.vertsplit(number), space.dimension
+    at = [ca.vertsplit(node) for node in ca.vertsplit(nodes, space.ambient)]
     z, assumed, weight = numbers[:z_width], numbers[z_width : z_width + constants], numbers[z_width + constants :]
+    origin = dict(enumerate(at[0])) if arity == 2 and measurement.frame != "nodes" else {}
+    if arity == 1 and measurement.linear:
+        origin, z = dict(zip(measurement.kept(d), z, strict=True)), [0.0] * z_width
+    moves = ca.vertsplit(steps, space.dof)
+    places = [_moved(space, node, ca.vertsplit(step), origin) for node, step in zip(at, moves, strict=True)]
     vectors, m = converted and measurement.name == CONVERTED, _namespace()
     try:
         local = _local(measurement, places)
@@ -136,7 +138,7 @@ def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
             gap = [sum(a * v for a, v in zip(row, local, strict=True)) for row in rows]
             gap[0] -= distance
         else:  # angles in [-pi, pi]: the derivative of the remainder is 1
-            parts = zip(measurement.residual(local, z, assumed, m), measurement.angles(space.dimension), strict=True)
+            parts = zip(measurement.residual(local, z, assumed, m), measurement.angles(d), strict=True)
             gap = [m.remainder(part, 2.0 * np.pi) if angle else part for part, angle in parts]
         size = len(gap)
         if kind.full:
@@ -199,10 +201,11 @@ def _namespace() -> Any:
     return SimpleNamespace(where=ca.if_else, **{name: getattr(ca, name) for name in same.split()})
 
 
-def _moved(space: Space, node: Numbers, step: Numbers) -> tuple[Numbers, list[Numbers]]:
-    """Position and rotation (d rows of d) of a node after a step."""
+def _moved(space: Space, node: Numbers, step: Numbers, origin: dict[int, Any]) -> tuple[Numbers, list[Numbers]]:
+    """Position from an origin, so that far away its digits are those of a step, and rotation (d rows of d) of a node
+    after a step."""
     d = space.dimension
-    at = [node[k] + step[k] for k in range(d)]
+    at = [node[k] - origin.get(k, 0.0) + step[k] for k in range(d)]
     if not space.has_rotation:
         return at, []
     return at, _product([node[d + d * i :][:d] for i in range(d)], cayley(step[d:]))
