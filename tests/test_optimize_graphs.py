@@ -16,7 +16,7 @@ from scipy.sparse import csc_array
 from unseen_graphs import drone, range_aided, world
 
 import coopoc as co
-from coopoc.formats.graph import PointEdges, PoseEdges, RangeEdges
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import sparse
 from coopoc.optimize.assess.assess import DENSE_COLUMNS, _seen, as_stated, assess, expected, newton_decrease
@@ -262,6 +262,8 @@ def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():
     assert from_graph(
         replace(graph, pose_prior=PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)]))
     ).fixed == (0, 80)
+    alone = Graph(2, ("A0", "A1"), [True] * 2, [[1.0, 2], [9, 9]], [[0.0], [1.5]])
+    assert from_graph(alone).x0[:, :2].tolist() == [[1, 2], [9, 9]]
 
 
 @pytest.mark.parametrize("start", ["auto", "odometry", "tree", "incremental"])

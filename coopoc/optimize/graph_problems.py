@@ -14,7 +14,7 @@ from ..formats import load_graph
 from ..formats.graph import Graph
 from ..kernels.compiling.waiting import clock, load
 from .algebra.sparse import LIBRARIES
-from .model.factor import Factor
+from .model.factor import Factor, unchecked
 from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import (
@@ -82,11 +82,14 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     load(*LIBRARIES)
     began, notes, factors = clock(), _counted(graph.notes), _factors(graph, objective)
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
+    given, graph = graph, unchecked(graph, fixed=_fixed(graph))
     first = "odometry" if start in ("auto", "incremental") else start
     start_x = _x0(graph, poses, first)
-    problem = Problem(graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
+    problem = Problem(
+        graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=tuple(graph.fixed.tolist())
+    )
     problem = problem.starting_at(directed(problem, start_x))
-    if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
+    if len(graph.fixed) - len(given.fixed) > (not len(given.fixed)):
         notes.append(
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
             "and nothing places one to another"
@@ -224,10 +227,10 @@ def _check_noise(graph: Graph, nodes: Ints, variance: Floats) -> None:
         raise InputError("covariance", whose, "must be positive", hint)
 
 
-def _fixed(graph: Graph) -> tuple[int, ...]:
+def _fixed(graph: Graph) -> Ints:
     """The fixed vertices, and the first pose of each part of the graph that has neither those nor priors."""
     edges = (graph.relative_pose, graph.relative_point, graph.ranges)
     part = parts(len(graph.names), *(each.nodes for each in edges))
     held = np.concatenate([graph.fixed, graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])
     loose = np.flatnonzero(graph.is_pose & ~np.isin(part, part[held]))
-    return tuple(np.sort(np.concatenate([graph.fixed, loose[np.unique(part[loose], return_index=True)[1]]])).tolist())
+    return np.sort(np.concatenate([graph.fixed, loose[np.unique(part[loose], return_index=True)[1]]]))
