@@ -104,8 +104,8 @@ def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = F
     except LinAlgError:
         sound = False
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
-        unknown = np.full((*still.shape, still.shape[1]), nan)
-        return Assessment(linear.cost, size, unknown, nan, _unobservable(problem, J, active), active)
+        free = _unobservable(problem, J, active)
+        return Assessment(linear.cost, size, np.full((*still.shape, still.shape[1]), nan), nan, free, active)
     cov = cov * ~(still[:, :, None] | still[:, None, :])
     return Assessment(linear.cost, size, cov, float(abs(dx).max(initial=0.0)), (), active)
 
@@ -126,10 +126,8 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
     unknown = Assessment(cost, size, none, nan)
 
     def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
-        far = float(abs(dx).max(initial=0.0))
-        return Assessment(
-            cost, size, cov, far, leverage=leverage, predicted=0.5 * abs(float(gradient @ dx)), curved=curved
-        )
+        far, gain = float(abs(dx).max(initial=0.0)), 0.5 * abs(float(gradient @ dx))
+        return Assessment(cost, size, cov, far, predicted=gain, curved=curved, leverage=leverage)
 
     own, cov = _largest(problem, entries, values[entries.diagonal]), none
     step, leverage = (variance := np.full(entries.size, inf)), 0.0
@@ -393,10 +391,8 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
             whys += [f"{pushing} bounds that push contradict the measurements"]
         elif equal := sorted({c.kind for c in problem.constraints if (c.lower == c.upper).any()}):
             whys += [f"constraints of {', '.join(equal)} that contradict the measurements"]
-        why = ", ".join([*whys, "outliers, or noise that is stated too small"])
-        notes.append(
-            f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: {why}"
-        )
+        cost = f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: "
+        notes.append(cost + ", ".join([*whys, "outliers, or noise that is stated too small"]))
     return mean + spent, tuple(notes)
 
 
@@ -417,8 +413,7 @@ def as_stated(problem: Problem) -> Problem:
     if not any(f.twice for f in problem.factors):
         return problem
     share = np.sqrt([1.0] * problem.dimension + [0.5] * (problem.space.ambient - problem.dimension))
-    factors = (reweighed(f, share) if f.twice else f for f in problem.factors)
-    return problem.replace_unchecked(factors=tuple(factors))
+    return problem.replace_unchecked(factors=tuple(reweighed(f, share) if f.twice else f for f in problem.factors))
 
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
@@ -447,17 +442,16 @@ def expected(problem: Problem, unknowns: int, leverage: float = inf) -> tuple[fl
     angles that they hold. Those of the plane that weigh twice add 1/2 and 3/2 more but for their `leverage`, one a
     pose at most: the mean is 1/2 tr((I - P) S), P = J (J^T J)^-1 J^T, S the covariance of whitened residuals.
     """
-    d, angles, count, matrices = problem.dimension, problem.space.angles, 0, 0
+    count = matrices = 0
     for factor in problem.factors:
         measured = factor.measured
         if factor.kind in CHORDAL:
-            turned = np.count_nonzero(factor.root[:, :, d:].any(1), axis=1)
-            measured = measured - np.maximum(turned - angles, 0)
+            turned = np.count_nonzero(factor.root[:, :, problem.dimension :].any(1), axis=1)
+            measured = measured - np.maximum(turned - problem.space.angles, 0)
             matrices += int(np.count_nonzero(turned)) * factor.twice
         count += int(measured.sum())
-    spare = count - unknowns
     turns = max(matrices - min(leverage, len({*problem.poses} - {*problem.fixed})), 0.0)
-    mean = 0.5 * (max(spare, 0) + turns)
+    mean = 0.5 * (max(count - unknowns, 0) + turns)
     return mean, mean + turns
 
 
@@ -467,9 +461,9 @@ def _leverage(problem: Problem, x: Floats) -> float:
     if not any(f.twice for f in problem.factors):
         return 0.0
     turns = stacked(np.tile(f.twice & (np.arange(f.size) >= problem.dimension), len(f.nodes)) for f in problem.factors)
-    signs = turns * np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, len(turns)))
-    probes = (linearised(problem, x)[1].T @ signs.T)[problem.movable.ravel()]
-    return float(np.sum(probes * columns_solved(sparse(problem).cholesky, probes)) / PROBES)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(turns), PROBES))
+    probes = (linearised(problem, x)[1].T @ (turns[:, None] * signs))[problem.movable.ravel()]
+    return float(np.vdot(probes, columns_solved(sparse(problem).cholesky, probes)) / PROBES)
 
 
 def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str | int]) -> Floats:
@@ -509,8 +503,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     truth = assess(problem, x, covariance=False)
     model: Model = "newton" if truth.curved else "gauss-newton"
     if truth.unobservable or not system.cholesky.factor(system.quadratic(x, model)[2]):
-        hint = "Add measurements of solution.unobservable."
-        raise InputError("problem", repr(problem), "must be observable", hint)
+        raise InputError("problem", repr(problem), "must be observable", "Add measurements of solution.unobservable.")
     wanted = system.entries.number[places].ravel()
     unit = (np.arange(system.size)[:, None] == wanted).astype(float)
     solved = columns_solved(system.cholesky, unit) if places else unit

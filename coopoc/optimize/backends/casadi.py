@@ -21,7 +21,6 @@ from ..model.problem import Problem
 
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
-QUIET: dict[str, Any] = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
 IPOPT = {
     "print_level": 0,
     "sb": "yes",
@@ -57,8 +56,9 @@ def solver(
     >>> solve(problem.constrain("range", ("a", "b"), upper=7.0), "casadi").x.round(3)[:, 0]
     array([1., 8.])
     """
-    form, (_, lower, upper) = structure_of(problem), _numbers(problem, x)
-    equal, moving = int((lower == upper).sum()), int(form.movable.sum())
+    numbers, lower, upper = _numbers(problem, x)
+    space, free, count = problem.space, problem.movable, 0
+    equal, moving = int((lower == upper).sum()), int(free.sum())
     if equal > moving:
         raise InputError(
             "constraints",
@@ -66,20 +66,19 @@ def solver(
             f"must be at most the {moving} numbers that can move",
             "Leave out those that follow from the others.",
         )
-    nlp = programme(form, int(max_iterations), get_ident())
-    space, free, count = form.space, form.movable, 0
+    nlp = programme(structure_of(problem), int(max_iterations), get_ident())
     multipliers = 0.0
     for _ in range(10):  # for poses again around the answer until it stays
-        numbers, lower, upper = _numbers(problem, x)
         end = nlp(p=numbers, lbg=lower, ubg=upper, lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
         status = stats["return_status"]
-        before, step, count = x, np.zeros(free.shape), count + int(stats["iter_count"])
+        step, count = np.zeros(free.shape), count + int(stats["iter_count"])
         step[free] = at
         if np.isfinite(at).all():
-            x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
-        if not space.has_rotation or status in HOPELESS or abs(x - before).max(initial=0.0) <= tolerance:
+            x = space.retract(x, _exponential(step))
+        if status in HOPELESS or not (space.has_rotation and abs(at).max(initial=0.0) > tolerance):
             break
+        numbers, lower, upper = _numbers(problem, x)
     return SolverResult(x, count, status == HOPELESS[0], {"return_status": status})
 
 
@@ -91,7 +90,7 @@ def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
     """
     system = sparse(problem)
     curvature = system.quadratic(x, "gauss-newton")[2][system.entries.diagonal].max(initial=1e-12)
-    parts, sides = [x.T, *system.numbers], [np.empty((2, 0))]
+    parts, sides = [x, *system.numbers], [np.empty((2, 0))]
     for c in problem.constraints:
         item = as_factor(c)
         (value,) = linearise(problem.space, [item], None, x).residual
@@ -101,14 +100,12 @@ def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
     return np.concatenate([*(part.ravel() for part in parts), [1.0 / curvature]]), *np.hstack(sides)
 
 
-def _exponential(step: Floats, dimension: int) -> Floats:
+def _exponential(step: Floats) -> Floats:
     """Steps whose turn is that of the Cayley map, C(w) = Exp(2 atan(|w|/2) w/|w|); in the plane both are the angle."""
-    if dimension == 2:
-        return step
-    w = step[:, dimension:]
+    w = step[:, 3:]
     half = 0.5 * np.linalg.norm(w, axis=-1, keepdims=True)
     ratio = np.where(half > 1e-9, np.arctan(half) / np.maximum(half, 1e-9), 1.0)
-    return np.concatenate([step[:, :dimension], ratio * w], axis=-1)
+    return np.concatenate([step[:, :3], ratio * w], axis=-1)
 
 
 @lru_cache(maxsize=64)
@@ -118,8 +115,8 @@ def programme(structure: Structure, max_iterations: int, thread: int) -> Any:
 
     symbols, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**symbols, "p": ca.vertcat(symbols["p"], scale), "f": scale * symbols["f"]}
-    options = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
-    return ca.nlpsol("solver", "ipopt", nlp, options)
+    options: Any = dict.fromkeys(("print_time", "calc_lam_p", "show_eval_warnings", "error_on_fail"), False)
+    return ca.nlpsol("solver", "ipopt", nlp, options | {"ipopt": {**IPOPT, "max_iter": max_iterations}})
 
 
 BACKEND = Backend(

@@ -142,11 +142,8 @@ class Programme:
         weak = KKT * float(np.maximum(abs(q), abs(own * dx)).max(initial=0.0))
         if not (abs(rest + self._rows.T @ y) <= weak + NEGLIGIBLE * own).all():
             return False
-        kept = (value >= lower - BOUND_TOLERANCE) & (value <= upper + BOUND_TOLERANCE)
-        pushed = ((y <= weak) | (value >= upper - BOUND_TOLERANCE)) & (
-            (y >= -weak) | (value <= lower + BOUND_TOLERANCE)
-        )
-        return bool(np.all(kept & pushed))
+        met = np.where(y > weak, upper, np.where(y < -weak, lower, np.clip(value, lower, upper)))
+        return bool((abs(value - met) <= BOUND_TOLERANCE).all())
 
 
 def _programme(problem: Problem, layout: Layout) -> Programme:

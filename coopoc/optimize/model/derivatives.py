@@ -121,15 +121,15 @@ def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
     measurement, space = kind.measurement, kind.space
     arity, (z_width, constants, _) = measurement.arity, kind.widths
     nodes, steps = ca.SX.sym("nodes", arity * space.ambient), ca.SX.sym("steps", arity * space.dof)
-    number = ca.SX.sym("number", sum(kind.widths))
+    number: Any = ca.SX.sym("number", sum(kind.widths))
     numbers, d = ca.vertsplit(number), space.dimension
-    at = [ca.vertsplit(node) for node in ca.vertsplit(nodes, space.ambient)]
+    at = [*map(ca.vertsplit, ca.vertsplit(nodes, space.ambient))]
     z, assumed, weight = numbers[:z_width], numbers[z_width : z_width + constants], numbers[z_width + constants :]
     origin = dict(enumerate(at[0])) if arity == 2 and measurement.frame != "nodes" else {}
     if arity == 1 and measurement.linear:
         origin, z = dict(zip(measurement.kept(d), z, strict=True)), [0.0] * z_width
-    moves = ca.vertsplit(steps, space.dof)
-    places = [_moved(space, node, ca.vertsplit(step), origin) for node, step in zip(at, moves, strict=True)]
+    moves = map(ca.vertsplit, ca.vertsplit(steps, space.dof))
+    places = [_moved(space, *each, origin) for each in zip(at, moves, strict=True)]
     vectors, m = converted and measurement.name == CONVERTED, _namespace()
     try:
         local = _local(measurement, places)
@@ -167,27 +167,26 @@ def expressions(structure: Structure) -> dict[str, Any]:
     import casadi as ca
 
     space, n = structure.space, structure.nodes
-    centre = ca.SX.sym("centre", n, space.ambient)
+    centre = ca.SX.sym("centre", space.ambient, n)
     steps = ca.SX.sym("dx", int(structure.movable.sum()))
-    step = ca.SX.zeros(n, space.dof)
-    for k, (i, j) in enumerate(np.argwhere(structure.movable).tolist()):
-        step[i, j] = steps[k]
+    step = ca.SX.zeros(space.dof, n)
+    step[np.flatnonzero(structure.movable).tolist()] = steps
 
-    def each(term: Term, number: Any) -> list[Any]:
-        """The whitened residuals of all measurements of a term, their numbers (M, P)."""
+    cost, numbers, bounds = 0.0, list[Any](), []
+
+    def each(term: Term) -> list[Any]:
+        """The whitened residuals of all measurements of a term, whose numbers (M, P) come last."""
+        numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
         symbols, one = residual_of(term.kind)
         white = ca.Function("white", symbols, [one])
-        places = [(ca.vec(centre[nodes, :].T), ca.vec(step[nodes, :].T)) for nodes in term.nodes.tolist()]
-        return [white(at, number[k, :].T, moved) for k, (at, moved) in enumerate(places)]
+        places = [(ca.vec(centre[:, nodes]), ca.vec(step[:, nodes])) for nodes in term.nodes.tolist()]
+        return [white(at, numbers[-1][k, :].T, moved) for k, (at, moved) in enumerate(places)]
 
-    cost, numbers, bounds = 0.0, [], []
     for term in structure.factors:
-        numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
-        for white in each(term, numbers[-1]):
+        for white in each(term):
             cost += 0.5 * robust(ca.sumsqr(white), term.kind.loss)
     for term in structure.constraints:
-        numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
-        bounds.append(ca.vertcat(*each(term, numbers[-1]))[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
+        bounds.append(ca.vertcat(*each(term))[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
     f, g = ca.cse([ca.SX(cost), ca.vertcat(*bounds)])  # a node's turn is that of all its measurements
     return {"x": steps, "p": ca.veccat(centre, *numbers), "f": f, "g": g}
 
@@ -197,8 +196,7 @@ def _namespace() -> Any:
     """CasADi as the namespace of a formula."""
     import casadi as ca
 
-    same = "sqrt sin cos atan2 log1p fabs fmax remainder"
-    return SimpleNamespace(where=ca.if_else, **{name: getattr(ca, name) for name in same.split()})
+    return SimpleNamespace(**vars(ca), where=ca.if_else)
 
 
 def _moved(space: Space, node: Numbers, step: Numbers, origin: dict[int, Any]) -> tuple[Numbers, list[Numbers]]:
@@ -226,8 +224,8 @@ def cayley(w: Numbers) -> list[Numbers]:
     return [[float(i == j) + share * (skew[i][j] + 0.5 * twice[i][j]) for j in range(3)] for i in range(3)]
 
 
-def _product(a: list[Numbers], b: list[Numbers]) -> list[Numbers]:
-    return [[sum(a[i][k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
+def _product(a: Any, b: Any) -> list[Numbers]:
+    return [[sum(p * q for p, q in zip(row, column, strict=True)) for column in zip(*b, strict=True)] for row in a]
 
 
 def _local(measurement: Measurement, places: list[tuple[Numbers, list[Numbers]]]) -> Numbers:
@@ -238,9 +236,9 @@ def _local(measurement: Measurement, places: list[tuple[Numbers, list[Numbers]]]
         return vector
     if measurement.frame == "nodes" or measurement.arity == 1:
         return [c for at, turned in places for row in (at, *turned) for c in row]
-    back = [list(column) for column in zip(*body, strict=True)]
-    vector = [row[0] for row in _product(back, [[v] for v in vector])]
-    return vector if measurement.frame == "body" else [*vector, *(c for row in _product(back, other) for c in row)]
+    [vector] = _product([vector], body)
+    turned = _product(zip(*body, strict=True), other)
+    return vector if measurement.frame == "body" else [*vector, *(c for row in turned for c in row)]
 
 
 class Written(NamedTuple):
@@ -294,9 +292,7 @@ def _tape(function: Any, name: str) -> "Tape":
     """The operations of a CasADi function of one vector."""
     from ...kernels.graphs.graph_tape import Operation, Tape
 
-    operations, constant = _operations(), int(Operation.CONST)
-    read_in, write_out = int(Operation.INPUT), int(Operation.OUTPUT)
-    count = function.n_instructions()
+    operations, count = _operations(), function.n_instructions()
     code, operands, value = np.zeros(count, int), np.zeros((count, 3), int), np.zeros(count)
     for k in range(count):
         instruction = function.instruction_id(k)
@@ -305,11 +301,11 @@ def _tape(function: Any, name: str) -> "Tape":
             raise InputError("kind", repr(name), allowed, "Use +, -, *, /, ** and the functions of m.")
         code[k] = operation = operations[instruction]
         read, written = function.instruction_input(k), function.instruction_output(k)
-        if operation == constant:
+        if operation == Operation.CONST:
             operands[k, 0], value[k] = written[0], function.instruction_constant(k)
-        elif operation == read_in:
+        elif operation == Operation.INPUT:
             operands[k, :2] = written[0], read[1]
-        elif operation == write_out:
+        elif operation == Operation.OUTPUT:
             operands[k, :2] = written[1], read[0]
         else:
             operands[k] = written[0], read[0], read[-1]
@@ -317,15 +313,14 @@ def _tape(function: Any, name: str) -> "Tape":
 
 
 @lru_cache(maxsize=1)
-def _operations() -> dict[int, int]:
+def _operations() -> dict[int, Any]:
     """CasADi's number of an operation -> ours."""
     import casadi as ca
 
     from ...kernels.graphs.graph_tape import Operation
 
-    operations = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
-    # the two of one slot, which is read twice
-    return operations | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}
+    twice = {ca.OP_SQ: Operation.MUL, ca.OP_TWICE: Operation.ADD}  # of one slot, which is read twice
+    return {getattr(ca, f"OP_{operation.name}"): operation for operation in Operation} | twice
 
 
 @dataclass(frozen=True, eq=False)

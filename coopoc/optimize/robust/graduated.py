@@ -111,8 +111,8 @@ def bounds(marked: Marked, threshold: float) -> Floats:
         "threshold", threshold, TINY, np.nextafter(1.0, 0.0), allowed="a probability in (0, 1)", hint=hint
     )
 
-    freedom = marked.collected(lambda factor: factor.measured)
-    return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
+    half = 0.5 * np.maximum(marked.collected(lambda factor: factor.measured), 1.0)
+    return np.asarray(2.0 * gammaincinv(half, threshold))
 
 
 MAX_ROUNDS = 300
@@ -216,7 +216,7 @@ def contest(
         ends = {name: landed(at) for name, at in starts.items()}
         costs = {name: np.nan_to_num(cost(at), nan=inf) for name, at in ends.items()}
         best = min(ends, key=costs.__getitem__)
-        if bool((graduation.weight == 1.0).all()) and not higher(costs["graduated"], costs[best]):
+        if (graduation.weight == 1.0).all() and not higher(costs["graduated"], costs[best]):
             return "graduated", ends["graduated"], graduation, ()
         loose = movable(cauchy)
         mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
@@ -281,8 +281,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     """
     steps, search = 0, problem.search
     robust = {k: f.loss for k, f in enumerate(problem.factors) if f.loss is not None}
-    bare = tuple(unchecked(f, loss=None) for f in problem.factors)
-    marked = mark(problem.replace_unchecked(factors=bare), list(robust))
+    marked = mark(problem.replace_unchecked(factors=tuple(unchecked(f, loss=None) for f in problem.factors)), [*robust])
     marked = replace(marked, bound=np.array([robust[k].scale ** 2 for k in marked.factor.tolist()]))
 
     def inner(part: Problem) -> Floats:
@@ -292,7 +291,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
         return end.x
 
     best, x, _, notes = contest(marked, inner, start, lambda at: inner(problem.starting_at(at)), sparse(problem).cost)
-    name = search.start if best == "x0" and search.start else best
+    best = search.start or best if best == "x0" else best
     return problem.starting_at(x).replace_unchecked(
-        search=search._replace(start=name, iterations=search.iterations + steps, notes=(*search.notes, *notes))
+        search=search._replace(start=best, iterations=search.iterations + steps, notes=(*search.notes, *notes))
     )

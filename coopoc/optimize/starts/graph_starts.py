@@ -269,9 +269,8 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
         if np.isfinite(graph.position[node]).all() and (graph.guess or k < len(robots)):
             roots.append((node, graph.position[node], graph.rotation[node]))
         else:
-            at = np.zeros(graph.dimension)
-            at[:2] = around * np.cos(angle), around * np.sin(angle)
-            roots.append((node, at, np.eye(graph.dimension)))
+            at = around * np.array([np.cos(angle), np.sin(angle), 0.0])
+            roots.append((node, at[: graph.dimension], np.eye(graph.dimension)))
     return roots
 
 

@@ -157,6 +157,5 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
     variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
     if factor.measurement.compares_poses:
         z = np.hstack([space.position(z), to_orientation(space.rotation(z))])
-        turn = 1.0 / information[:, d:].mean(axis=1, keepdims=True)
-        variance = np.hstack([variance, np.repeat(turn, space.angles, axis=1)])
+        variance = np.hstack([variance, *[1.0 / information[:, d:].mean(axis=1, keepdims=True)] * space.angles])
     return z, variance[:, :, None] * np.eye(variance.shape[1])

@@ -94,8 +94,7 @@ def firm(ranges: Ranges) -> Bools:
     problem, x, known = ranges.problem, ranges.x, np.zeros(len(ranges.x))
     for f in problem.factors:
         if f.kind == "position":
-            own = np.square(f.root).sum(1).min(1)
-            own = own if f.loss is None else own * (squared(problem, f, x) <= f.loss.scale**2)
+            own = np.square(f.root).sum(1).min(1) * _accepted(problem, f, x)
             known += np.bincount(f.nodes[:, 0], own, len(x))
     known[list(problem.fixed)] = inf
     v, weight, far = ((known > 0) / np.maximum(known, TINY))[ranges.nodes], ranges.weight**2, ranges.distance**2
@@ -119,19 +118,16 @@ def bodies(problem: Problem, x: Floats) -> list[Ints]:
     held = firm(ranges_of(problem, x))
     for f in problem.factors:
         if f.nodes.shape[1] == 1 and f.kind != "position":
-            held[_accepted(problem, f, x)] = True
+            held[f.nodes[f.informative & _accepted(problem, f, x), 0]] = True
     if held.all():
         return []
     part = parts(len(x), *(f.nodes[f.informative] for f in problem.factors if f.kind not in vague))
     return [np.flatnonzero(part == body) for body in np.setdiff1d(part, part[held])]
 
 
-def _accepted(problem: Problem, factor: Factor, x: Floats) -> Ints:
-    """Nodes that a factor of one node each holds at x."""
-    kept = factor.informative
-    if factor.loss is not None:
-        kept = kept & (squared(problem, factor, x) <= factor.loss.scale**2)
-    return np.asarray(factor.nodes[kept, 0])
+def _accepted(problem: Problem, factor: Factor, x: Floats) -> Bools | bool:
+    """(M,) which measurements of a factor a robust loss does not reject at x, or True."""
+    return factor.loss is None or squared(problem, factor, x) <= factor.loss.scale**2
 
 
 def scaled(problem: Problem, x: Floats) -> Floats:
