@@ -110,3 +110,12 @@ def test_anchors_among_poses_and_constraints_without_a_backend():
         found = solve(PAIR.constrain(kind, nodes, upper=[7, 9, 9] if kind == "displacement" else 7.0))
         assert (found.backend, found.x[1, 0] - found.x[0, 0]) == (backend, pytest.approx(7.0, abs=1e-6))
         assert f"solved by {backend}: gauss-newton cannot" in found.notes
+
+
+@pytest.mark.parametrize(("kind", "z"), [("azimuth", 1.0), ("bearing", 1.0), ("displacement", [0.0, 0, 0])])
+def test_a_minimum_at_which_an_angle_has_no_derivative_is_named(kind, z):
+    """The fixes put the second node on the axis of the angle; two that coincide have a displacement."""
+    problem = Problem([*"ab"], poses=(0,)).add("pose", "a", co.pose([0.0, 0, 0], [np.pi / 2, 0, 0]), std=0.1)
+    problem = problem.add("position", "b", [0, -3.0 * (kind == "bearing"), 0], std=1.0)
+    found = solve(problem.add(kind, (0, 1), z, std=0.1), throw=False)
+    assert ("nearly coincide" in str(found.notes)) == (kind != "displacement")

@@ -17,7 +17,7 @@ from .assess.assess import Assessment, assess, is_constrained_minimum, judged, n
 from .backend import MAX_ITERATIONS, Backend, Options, SolverResult, require_backend
 from .descent.levenberg_marquardt import arrive
 from .graph_problems import started
-from .model.factor import fused, stacked
+from .model.factor import fused
 from .model.measurements import CONVERTED
 from .model.problem import Problem, Search
 from .robust.graduated import robust_start
@@ -133,9 +133,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem = problem.replace_unchecked(constraints=constraints)
     result = backend.run(problem, start, options)
     if constraints:
-        near = not has_start or abs(problem.cost(given) - problem.cost(result.x)) <= RIVAL_COST
-        told = whole or (near and not searching)
-        problem, result = (problem, result) if told else _drawn(problem, backend, options, result, has_start)
+        far = has_start and abs(problem.cost(given) - problem.cost(result.x)) > RIVAL_COST
+        if not whole and (far or searching):
+            problem, result = _drawn(problem, backend, options, result, has_start)
     elif has_start and not problem.linear:
         problem, result = _challenged(problem, backend, options, result, whole)
     search = problem.search
@@ -151,7 +151,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
     expected, notes = judged(problem, x, truth)
-    if np.isfinite(truth.cost) and not (status is Status.SOLVED and truth.remaining <= POSITION_TOLERANCE):
+    if np.isfinite(truth.cost):
         notes = (*notes, *_unsolved(problem, x, truth, status))
     return Solution(
         x=x,
@@ -180,9 +180,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
 def _searched(problem: Problem, start: Floats, end: Floats | None, draws: bool) -> Problem:
     """A problem of points from where its converted measurements (n, d), multidimensional scaling, random starts, if it
     `draws`, or an x0, which led to the `end` (n, d), lead lowest."""
-    starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
-    began = clock()
-    problem, won = race(problem, starts, {}, draws=draws, reached=end)
+    began, starts = clock(), {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
+    problem, won = race(problem, starts, {}, draws, end)
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
@@ -233,7 +232,7 @@ def _challenged(
         return problem, first
     if near:
         strange = any(f.measurement.frame == "nodes" and f.kind not in IMAGED for f in problem.factors)
-        other, won = race(problem, {}, {}, draws=strange, reached=x)
+        other, won = race(problem, {}, {}, strange, x)
         if not won.iterations:
             return problem, first
     else:
@@ -285,29 +284,38 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
         return Status.FAILED
     if truth.unobservable:
         return Status.RANK_DEFICIENT
-    still = truth.remaining <= POSITION_TOLERANCE
-    if not (still or truth.predicted <= DECREASE * max(truth.cost, 1.0)):
+    still, least = truth.remaining <= POSITION_TOLERANCE, DECREASE * max(truth.cost, 1.0)
+    if not (still or truth.predicted <= least):
         return Status.FAILED
     if truth.active is not None:
         return Status.SOLVED if is_constrained_minimum(problem, x, truth.active) else Status.SADDLE
     left = truth.predicted if truth.newton else newton_decrease(problem, x)
     if left is None:
         return Status.SADDLE
-    return Status.SOLVED if left <= max(DECREASE * max(truth.cost, 1.0), NEWTON_DECREASE * still) else Status.FAILED
+    return Status.SOLVED if left <= max(least, NEWTON_DECREASE * still) else Status.FAILED
 
 
 def _unsolved(problem: Problem, x: Floats, truth: Assessment, status: Status) -> Iterator[str]:
-    """Why nodes x (n, ambient) are no minimum that stands: a node far away, two that coincide, a step that is left."""
-    at, names = problem.space.position(x), problem.names
-    off = norm(at - np.median(at, axis=0), axis=1)
-    extent, lost = np.median(off), (off * problem.movable.any(1)).argmax()
-    if off[lost] > AWAY * extent > 0.0:
-        yield f"{names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby"
-    if status is Status.SOLVED:
-        return
-    pairs = stacked((f.nodes for f in problem.factors if f.nodes.shape[1] == 2), 2)
-    for i, j in pairs[norm(np.diff(at[pairs][..., :2], axis=1), axis=(1, 2)) < COINCIDENT * extent][:1]:
-        yield f"{names[i]} and {names[j]} nearly coincide, or differ in height alone: no direction has a derivative"
+    """Why nodes x (n, ambient) are no minimum that stands: a node far away, two that coincide, at a minimum in an
+    angle's formula and to the tolerance, a step that is left."""
+    at, names, near, solved = problem.space.position(x), problem.names, POSITION_TOLERANCE, status is Status.SOLVED
+    if not (solved and truth.remaining <= POSITION_TOLERANCE):
+        off = norm(at - np.median(at, axis=0), axis=1)
+        extent, lost = np.median(off), (off * problem.movable.any(1)).argmax()
+        if off[lost] > AWAY * extent > 0.0:
+            yield f"{names[lost]} went {off[lost]:.2g} m away: what is measured of it fits no place nearby"
+        near = near if solved else COINCIDENT * extent
+    for f in problem.factors:
+        kind = f.measurement
+        if kind.arity != 2 or (solved and (kind.frame == "nodes" or "angle" not in kind.components)):
+            continue
+        gap = np.diff(at[f.nodes], axis=1)
+        if kind.frame == "body":
+            gap = gap @ problem.space.rotation(x)[f.nodes[:, 0]]
+        off = np.hypot(*gap[:, 0, :2].T)
+        if off.min(initial=np.inf) < near:
+            pair = " and ".join(names[node] for node in f.nodes[off.argmin()])
+            yield f"{pair} nearly coincide, or differ in height alone: no direction has a derivative"
     if status is Status.FAILED:
         yield f"another step would move a node by {truth.remaining:.2g} m or rad and save {truth.predicted:.2g}"
 

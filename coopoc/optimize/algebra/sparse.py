@@ -252,6 +252,6 @@ def sparse(problem: Problem) -> Sparse:
     """
     kept = problem.__dict__.get("sparse")
     if kept is None:
-        numbers = tuple(numbers_of(factor) for factor in problem.factors)
-        kept = problem.__dict__["sparse"] = Sparse(problem.space, layout_of(problem), numbers)
+        kept = Sparse(problem.space, layout_of(problem), tuple(map(numbers_of, problem.factors)))
+        problem.__dict__["sparse"] = kept
     return kept

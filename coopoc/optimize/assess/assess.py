@@ -130,7 +130,8 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         return Assessment(cost, size, cov, far, predicted=gain, curved=curved, leverage=leverage)
 
     own, cov = _largest(problem, entries, values[entries.diagonal]), none
-    step, leverage = (variance := np.full(entries.size, inf)), 0.0
+    step = variance = np.full(entries.size, inf)
+    leverage = 0.0
     if held := cholesky.factor(values):
         step, variance, leverage = cholesky.solve(gradient), 1.0 / cholesky.pivots, _leverage(problem, x)
         if not quick and (covariance or not (variance * own < INFLATION).all()):

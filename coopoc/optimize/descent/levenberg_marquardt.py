@@ -160,8 +160,7 @@ def arrive(
             if smooth and abs(gain - 1.0) >= NONQUADRATIC:
                 break
             if model == "gauss-newton":
-                off = abs(gain - 1.0) > MISMATCH
-                against = against + 1 if against < 0 or off else max(against - 1, 0)
+                against = against + 1 if against < 0 or abs(gain - 1.0) > MISMATCH else max(against - 1, 0)
                 against = HESSIAN_AFTER_STEPS if near else against
                 model = "newton" if against >= HESSIAN_AFTER_STEPS else model
             if not converged:

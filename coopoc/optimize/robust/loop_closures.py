@@ -67,8 +67,8 @@ def _free(marked: Marked, weight: Floats) -> tuple[Ints, Ints]:
     """(n,) parts that known inliers and candidates with a weight (G,) join, and the nodes that they join to no fixed
     one and not to the world."""
     problem = marked.problem
-    factors = marked.reweigh(weight, initial_guess(problem)).factors
-    measured = [factor.nodes[factor.informative] for factor in factors]
+    guess = initial_guess(problem)
+    measured = [factor.nodes[factor.informative] for factor in marked.reweigh(weight, guess).factors]
     part, alone = parts(len(problem.names), *measured), [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
     held: Ints = np.concatenate([problem.fixed, *alone]).astype(int)
     return part, np.flatnonzero(~np.isin(part, part[held]))
@@ -85,7 +85,7 @@ def unconfirmed(marked: Marked, weight: Floats) -> list[str]:
     _, which, count = np.unique(ends[kept], axis=0, return_inverse=True, return_counts=True)
     names = dict[str, None]()
     for group in marked.group[kept][count[which.ravel()] == 1].tolist():
-        without = np.where(np.arange(len(weight)) == group, 0.0, weight)
+        without = weight * (np.arange(len(weight)) != group)
         names |= {marked.problem.names[k]: None for k in _free(marked, without)[1][:1]}
     return [f"{name} is joined to the others by one candidate alone: nothing confirms it" for name in names]
 
