@@ -114,6 +114,19 @@ def test_a_receiver_that_errs_is_no_fault_of_odometry(alike, act):
     assert with_odometry(seen, EGOS, known)[1] is known
 
 
+@pytest.mark.parametrize(("turn", "most"), [(0.0, 0.7), (0.3, 3.0)])
+def test_fixes_weigh_by_their_own_deviations(turn, most):
+    """Of 1.5 and 15 m, by chance: right odometry was "corrected", 1.1 m; turned by 0.3 rad it led 12 m away."""
+    seen, truth = drive(1, 1.5)
+    factor = np.ones(seen.gnss.shape[1:3])
+    factor[:, EGOS] = 10.0 ** np.random.default_rng(4).integers(2, size=(STEPS, 2))
+    gnss, velocity = seen.gnss.copy(), seen.velocity.copy()
+    gnss[:, :, EGOS] += (factor[:, EGOS, None] - 1.0) * (gnss[:, :, EGOS] - truth)
+    velocity[:, BEGINS:] = turned(velocity[:, BEGINS:], np.full(velocity[:, BEGINS:].shape[:-1], turn))
+    track = Kalman()(replace(seen, gnss=gnss, velocity=velocity, fix_factor=factor), EGOS)
+    assert np.sqrt(np.square(track.x - truth)[:, 300:].sum(-1).mean()) < most
+
+
 def test_the_correction_is_the_velocity_of_filterpys_filter():
     """Position and error of the velocity, a random walk, from a fix a second, whose noise is as loud as they show."""
     seen, _ = drive(10, 3.5)

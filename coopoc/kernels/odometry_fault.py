@@ -29,11 +29,11 @@ LASTS, PATH, BEFORE, SPEED, FASTEST = 13, 14, 15, 17, 18
 of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
 fails, the evidence, for how long s and how far m there is some, and where odometry alone has led since m; squares of
 the most of late speeds and of all by odometry m^2/s^2."""
-WAY, SINCE, FIX, GAPS, TIMES, COUNT, LIKELY, BASE, RATIO, FLOOR, INTERVAL = 19, 21, 22, 24, 26, 27, *range(28, 33)
-"""Since then: the way by odometry m, the time s; the last fix m, sums of how far fixes were from the position and the
-way m, and of their times s, and how many there were; the logarithm of how likely late fixes were; and, all the time,
-the numbers of a MotionNoise, base and ratio squared."""
-WALK, ANEW, SHARE, RATE, STDS, DURATION, SIZE = range(33, 40)
+WAY, SINCE, FIX, GAPS, TIMES, WEIGHT, FINEST, LIKELY, BASE, RATIO, FLOOR, INTERVAL = 19, 21, 22, 24, *range(26, 34)
+"""Since then: the way by odometry m, the time s; the last fix m, weighted sums of how far fixes were from the position
+and the way m, and of their times s, and of the weights, 1 / variance m^-2; the largest weight of late fixes; the
+logarithm of how likely they were; and, all the time, the numbers of a MotionNoise, base and ratio squared."""
+WALK, ANEW, SHARE, RATE, STDS, DURATION, SIZE = range(34, 41)
 PACES = ((0.001, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 0.2, 0.5, 5.0, 2.0))
 """Of the random walks of b: the density of its acceleration m^2/s^3; the evidence that its filter loses where it begins
 anew; and the least error of an odometry that fails, as a share of the way, in m for each second, and in standard
@@ -53,7 +53,7 @@ NOISIER, UNKNOWN = 0.1, 4.0
 """Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
 for at first, and that of odometry all the time."""
 SPEED_MEMORY_S, LIKELY_KEPT = 10.0, 0.9
-"""s, for which a speed is remembered; share of LIKELY that is left at the next fix."""
+"""s, for which a speed and the largest weight are remembered; share of LIKELY that is left at the next fix."""
 
 
 def new_state(noise: MotionNoise) -> Floats:
@@ -120,28 +120,27 @@ def judge(states: Floats, x: float, y: float, r: float, dt: float) -> float:
 def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     """The square, m^2, of the gap between both filters of a pace at a fix from which on the odometry fails, else 0."""
     if isnan(state[PLACE]):
-        for i in range(BASE):
-            state[i] = 0.0
+        state[:BASE] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE_UNTIL], state[LEVEL] = r, 1.0, r, UNKNOWN
-        state[PLACE] = state[BELIEVED] = state[BEFORE] = state[FIX] = x
-        state[PLACE + 1] = state[BELIEVED + 1] = state[BEFORE + 1] = state[FIX + 1] = y
+        for k in (PLACE, BELIEVED, BEFORE, FIX):
+            state[k], state[k + 1] = x, y
         return 0.0
     if x == state[FIX] and y == state[FIX + 1]:  # to all digits: the receiver holds it
         return 0.0
-    state[FIX], state[FIX + 1], n, r = x, y, state[COUNT], r * state[LEVEL]
+    state[FIX], state[FIX + 1], n, weight, r = x, y, state[WEIGHT], 1.0 / r, r * state[LEVEL]
     east, north = x - state[PLACE] - state[WAY], y - state[PLACE + 1] - state[WAY + 1]
-    if (n * east - state[GAPS]) ** 2 + (
-        n * north - state[GAPS + 1]
-    ) ** 2 > 2.0 * n * n * RESTART_Q * r:  # it has jumped
-        state[GAPS] = state[GAPS + 1] = state[TIMES] = state[COUNT] = 0.0
-    state[GAPS] += east
-    state[GAPS + 1] += north
-    state[TIMES] += state[SINCE]
-    state[COUNT] += 1.0
+    most = RESTART_Q * n * (n * r + max(n * r, state[LEVEL]))
+    if (n * east - state[GAPS]) ** 2 + (n * north - state[GAPS + 1]) ** 2 > most:  # it has jumped
+        state[GAPS:FINEST] = 0.0
+    state[GAPS] += weight * east
+    state[GAPS + 1] += weight * north
+    state[TIMES] += weight * state[SINCE]
+    state[WEIGHT] += weight
+    state[FINEST] = max(state[FINEST], weight)
     if state[SINCE] < AVERAGED_FIXES_S - 0.5 * dt:
         return 0.0
     failed = state[FAILS] > 0.0
-    gather_evidence(state, r / state[COUNT], dt)
+    gather_evidence(state, dt)
     if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < state[DURATION]:
         return 0.0
     gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
@@ -154,9 +153,10 @@ def judge_pace(state: Floats, x: float, y: float, r: float, dt: float) -> float:
 
 
 @part
-def gather_evidence(state: Floats, r: float, dt: float) -> None:
-    """Move both filters on, and update them and the evidence by the mean of the fixes since, of variance r m^2."""
-    time, interval = state[SINCE], state[INTERVAL] if state[INTERVAL] > 0.0 else dt
+def gather_evidence(state: Floats, dt: float) -> None:
+    """Move both filters on, and update them and the evidence by the weighted mean of the fixes since."""
+    weight, time, interval = state[WEIGHT], state[SINCE], state[INTERVAL] if state[INTERVAL] > 0.0 else dt
+    r = state[LEVEL] / weight
     east, north = state[WAY] / time, state[WAY + 1] / time
     speed2, true2 = east**2 + north**2, (east + state[ERROR]) ** 2 + (north + state[ERROR + 1]) ** 2
     state[FASTEST] = max(state[FASTEST], speed2)
@@ -167,12 +167,12 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     p, pb, bb = state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2]
     p += 2.0 * time * pb + time * time * bb + state[WALK] * time**3 / 3.0 + q
     pb, bb = pb + time * bb + 0.5 * state[WALK] * time * time, bb + state[WALK] * time
-    sure = max(state[SURE_UNTIL] + q, r * time / WANDERS)
+    sure = max(state[SURE_UNTIL] + q, r * min(weight / state[FINEST], 1.0) * time / WANDERS)
     s, wide = p + r, sure + r
     square = believed = 0.0
     for c in range(2):
-        gap, moved = state[GAPS + c] / state[COUNT], state[WAY + c] + time * state[ERROR + c]
-        state[GAPS + c] = gap - state[ERROR + c] * state[TIMES] / state[COUNT]
+        gap, moved = state[GAPS + c] / weight, state[WAY + c] + time * state[ERROR + c]
+        state[GAPS + c] = gap - state[ERROR + c] * state[TIMES] / weight
         square += state[GAPS + c] ** 2 / s
         gap += state[PLACE + c] - state[BELIEVED + c]
         believed += gap**2 / wide
@@ -188,7 +188,6 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
         state[BEFORE + c] += gap if anew else 0.0
         state[ERROR + c] += 0.0 if anew else gain * gap
         state[BELIEVED + c] += trust * state[WAY + c]
-        state[GAPS + c] = state[WAY + c] = 0.0
     bb = max(bb, state[SPEED]) if anew else bb - gain * pb
     state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2] = share * r, (1.0 - share) * pb, bb
     state[SURE_UNTIL] = trust * r
@@ -203,7 +202,8 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
     if state[EVIDENCE] == 0.0:
         state[FAILS] = state[PATH] = state[LASTS] = 0.0
         state[BEFORE], state[BEFORE + 1] = state[PLACE], state[PLACE + 1]
-    state[SINCE] = state[TIMES] = state[COUNT] = 0.0
+    state[FINEST] /= 1.0 + time / SPEED_MEMORY_S
+    state[WAY:FIX] = state[GAPS:FINEST] = 0.0
 
 
 @compiled
@@ -232,8 +232,7 @@ def correct_drives(
                 measured = velocity[run, t, n]
                 moved[0], moved[1] = measured[0], measured[1]
                 if isnan(moved[0]):
-                    for i in range(len(state)):
-                        state[i, PLACE] = nan
+                    state[:, PLACE] = nan
                     continue
                 if t > 0:
                     extra = correct(state, moved, dt)
