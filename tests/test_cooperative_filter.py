@@ -14,7 +14,19 @@ from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, partial
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
+from coopoc import (
+    V2X,
+    CovarianceIntersection,
+    Fleet,
+    JointFilter,
+    Kalman,
+    Recording,
+    Sensors,
+    load_fleet,
+    nees,
+    observe,
+    rt_le,
+)
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import errors
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
@@ -227,7 +239,7 @@ def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
     relative[..., 1:] = nan
     for off in (30.0, 600.0):
         off_then = moved(seen, 10 // step * np.array(wrong), 24, [0.8 * off, -0.6 * off, 0.0])
-        for m in (Kalman(), JointFilter(), CooperativeFilter()):
+        for m in (Kalman(), JointFilter(), CooperativeFilter(), CovarianceIntersection(split=True)):
             for sees in (seen.relative, relative):
                 assert errors(m(replace(off_then, relative=sees), [24]), fleet)[:, late:].max() < 8.0
 

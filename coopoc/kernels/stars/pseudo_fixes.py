@@ -24,6 +24,7 @@ from ..compiling.small import (
     diagonal,
     inner_product,
     inverse,
+    load,
     minus_product,
     negate,
     scale,
@@ -33,9 +34,9 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
-from ..gate import FIX_GATE, distance, gate_fix, inflation
+from ..gate import BACK, FIX_GATE, distance, gate_fix, inflation
 from ..geometry import Numbers, completed, direction, metres, spread, vector
-from .gated import gate_components, inflated
+from .gated import STATE, Gates, carry, gate_components, gates_within, go_back, inflated
 from .joint_filter import write
 from .messages import (
     BLOCK,
@@ -48,7 +49,6 @@ from .messages import (
     Measurements,
     Star,
     block_at,
-    clear,
     gather,
     moved_of,
     new_estimates,
@@ -79,8 +79,6 @@ class Fusion(NamedTuple):
         gap: (3 most, LANES) m, from the ego to their pseudo-fixes.
         used: (most, LANES) 1, or 0 for one without a message.
         weight: (1, LANES) w.
-        cov: (9, LANES) m^2 of the fused estimate.
-        hits: (1, LANES) of the ego's fixes.
         split: keep independent errors apart.
         robust: gate fixes and pseudo-fixes.
         naive: take all errors as independent, measurements at the measured geometry, and each message once: MSMV.
@@ -92,8 +90,6 @@ class Fusion(NamedTuple):
     gap: Floats
     used: Floats
     weight: Floats
-    cov: Floats
-    hits: Floats
     split: bool
     robust: bool
     naive: bool
@@ -122,42 +118,47 @@ def run_intersection(
         np.zeros((3 * most, LANES)),
         np.ones((most, LANES)),
         np.zeros((1, LANES)),
-        np.zeros((9, LANES)),
-        np.zeros((1, LANES)),
         split,
         robust,
         naive,
     )
     for first in range(0, runs, LANES):
         star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
-        clear(fusion.hits)
+        gates = gates_within(1)
         for t in range(steps):
             star, before = before, star
             n = gather(star, before, measurements, model, first, last, t, old)
-            intersect(star, model, fusion, n, old)
-            write(out, fusion.x, fusion.cov, first, last, t, measurements.start[t], n)
+            intersect(star, model, fusion, gates, n, old)
+            write(out, fusion.x, gates.state, first, last, t, measurements.start[t], n)
             old = n
     return out
 
 
 @inner
-def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) -> None:
-    """Predict and fuse."""
+def intersect(star: Star, model: Assumptions, fusion: Fusion, gates: Gates, n: int, old: int) -> None:
+    """Predict, go back or begin anew as the joint filter does, and fuse."""
     fix, variance = position_of(star, 0), variance_of(star, 0)
     o, new = 0.0 * fix[0], take(star.status, NEW)
-    nothing, flat = zeros(o, BLOCK), o + model.flat
+    nothing, flat, hits = zeros(o, BLOCK), o + model.flat, o
     if old == 0:
         x, w, new = fix, o + 0.5, new if fusion.naive else o
-        add_source(fusion, 0, nothing, diagonal((flat, flat, flat) if fusion.naive else variance))
+        dependent, independent = nothing, diagonal((flat, flat, flat) if fusion.naive else variance)
     else:
         x, w = add(vector_at(fusion.x, 0), moved_of(star, 0)), take(fusion.weight, 0)
+        dependent = block_at(fusion.dependent, 0)
         independent = add_diagonal(block_at(fusion.independent, 0), process_of(star, 0))
-        add_source(fusion, 0, block_at(fusion.dependent, 0), independent)
-        if fusion.robust:
-            own, hits = own_cov(fusion), take(fusion.hits, 0)
-            share, hits = gate_fix(subtract(fix, x), own, variance, FIX_GATE, hits)
-            store(fusion.hits, 0, (hits,))
-            variance = scale(variance, share)
+    if fusion.robust:
+        store(fusion.x, 0, x)
+        carry(star, gates, model.flat, 1, min(old, 1))
+        back = go_back(star, gates, fusion.x, n)
+        anew, memory = back - BACK, load(gates.state, 0, STATE)
+        x, new = choose_each(anew, fix, vector_at(fusion.x, 0)), choose(anew, o, new)
+        dependent = choose_each(back, choose_each(anew, diagonal(variance), memory[:9]), dependent)
+        independent = choose_each(back, nothing, independent)
+        own, hits = add(dependent, independent), choose(anew, o, memory[12])
+        share, hits = gate_fix(subtract(fix, x), own, variance, FIX_GATE, hits)
+        variance = scale(variance, share)
+    add_source(fusion, 0, dependent, independent)
     fixed = diagonal((new / variance[0], new / variance[1], new / variance[2]))
     add_neighbours(star, model, fusion, x, n)
     alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
@@ -177,7 +178,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
         w = choose(worse, o + 1.0, w)
     dependent = product(product(cov, dependent), cov)
     store(fusion.x, 0, add(x, apply(cov, eta)))
-    store(fusion.cov, 0, cov)
+    store(gates.state, 0, (*cov, o, o, o, hits))
     store(fusion.dependent, 0, dependent)
     store(fusion.independent, 0, subtract(cov, dependent))
     store(fusion.weight, 0, (w,))
@@ -193,7 +194,7 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
         relative, variance = relative_of(star, k), variance_of(star, k)
         polar, noise, theirs, f = direction(gap), diagonal((unit, unit, unit)), diagonal(variance), unit
         if fusion.robust:
-            ahead = add(own_cov(fusion), theirs)
+            ahead = add(add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0)), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
             relative = inflated(relative, factor)
         complete = completed(relative, polar)
@@ -218,12 +219,6 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
 def trace(a: Numbers) -> float:
     """Of a 3 x 3 matrix."""
     return a[0] + a[4] + a[8]
-
-
-@inside
-def own_cov(fusion: Fusion) -> Lanes:
-    """Covariance m^2 of the ego's prediction."""
-    return add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
 
 
 @inside
