@@ -111,6 +111,21 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, nam
     assert "the odometry, which they else follow" not in " ".join(check(read).warnings)
 
 
+def test_a_velocity_that_few_fixes_show_is_no_surer_than_it_is(tmp_path):
+    """Fixes of 5 cm, the first second: 25 cm off, and NEES 24 and 51 (Kalman filter, smoother)."""
+    t, names, std = 0.1 * np.arange(100), list("abcde"), 0.05
+    x = np.broadcast_to(15.0 * t[:, None, None] * np.array([1.0, 0.0]), (100, 5, 2))
+    z = (x + default_rng(5).normal(0, std, x.shape)).reshape(-1, 2)
+    table = pd.DataFrame(z, columns=["x", "y"]).assign(t=t.repeat(5), vehicle=names * 100, x_std=std, y_std=std)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    recording = co.read_log(tmp_path / "log.csv").recording
+    for method in (co.Kalman(), co.BatchSmoother()):
+        track = method(recording, names)
+        square = np.square(track.x[0, :10, :, :2] - x[:10]).sum(-1)
+        assert square.mean() < 3.0 * std**2
+        assert (square / track.covariance[0, :10, :, :2, :2].trace(axis1=2, axis2=3)).mean() < 1.5
+
+
 @pytest.mark.parametrize("frame", ["world", "body"])
 @pytest.mark.parametrize("apart", [False, True])
 def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_path, frame, apart):

@@ -59,7 +59,7 @@ def constant_velocity(
                 p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, speed * speed / variance
                 for c in range(3):
                     x[m, c], u[m, c] = fixes[j, c], 0.0
-            growth[j] = nan
+            growth[j], spread[j], proved[j] = nan, p[0, 2], variance
             continue
         keep, most = exp(-dt / REMEMBERS), -inf
         for m in range(models):

@@ -65,8 +65,9 @@ def faults(recording: Recording, columns: Ints, noise_model: NoiseModel, fix: fl
     sensors = noise_model.sensors
     if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
         return None
-    more = recording.motion_extra[:, columns, 0]  # as uncertain at every step: fixes alone show the velocity
-    columns = columns[~np.isin(columns, recording.landmarks) & ~((more[0] > 0.0) & (np.ptp(more, axis=0) == 0.0))]
+    more = recording.motion_extra[:, columns, 0]
+    least = more.min(axis=0)  # usual: fixes alone show the velocity
+    columns = columns[~np.isin(columns, recording.landmarks) & ((least == 0.0) | (np.median(more, axis=0) > least))]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh = new_state(motion_noise(noise_model, recording.dt))
     drives = gnss, velocity, fresh, recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance), columns, recording.dt

@@ -228,7 +228,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     else:
         moved, times, heading = _in_world(name, rows, measured, shown, derived, way, steps)
         signals, rate = [times], none
-        velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else moved
+        velocity = moves = _before(shown.velocity, steps) if moved is None else moved
     there, by_fixes = _present(signals, steps) & np.isfinite(velocity[:, 0]), signals[0] is fixes
     held = _held(fixes, np.nan_to_num(moves), there, steps, again, way.std)
     if held.any():
@@ -237,7 +237,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         fixes = Signal(*(values[~held] for values in fixes))
         if by_fixes:
             shown, signals = velocity_of_fixes(way._replace(fixes=fixes), steps), [fixes]
-            velocity = moves = _by_fixes(fixes, shown, steps)
+            velocity = moves = _before(shown.velocity, steps)
             there, heading = _present(signals, steps), heading._replace(wanders=shown.wanders)
     gnss = _fixes_on_steps(rows, fixes, np.nan_to_num(moves), there, steps)
     fixed = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
@@ -253,6 +253,9 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
     summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2))
     wander = _wander(heading, moves, steps)
+    if by_fixes:  # at first a velocity is less certain than later, all the way to the next fix
+        unsure = _before(Signal(fixes.t, shown.std), steps)
+        wander = np.maximum(wander, np.ptp(fixes.t) / len(fixes.t) * unsure**2)
     climbs = 0.0 if flat or by_fixes or rows["kind"].isin(("vz", "vz_body")).any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
@@ -402,13 +405,10 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     return Shown(Signal(t, velocity), certain, wanders, np.sqrt(proved * spread))
 
 
-def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:
-    """(T, 3) m/s at each step, as fixes of the steps before have shown it; until then it leads from fix to fix."""
-    arrived = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME_INSTANT) - 1
-    last = np.append(-1, arrived[:-1])
-    new = (last >= 0) & (arrived > last)
-    leads = np.where(new[:, None], (fixes.value[arrived] - fixes.value[last]) / steps.dt, 0.0)
-    return np.where(((last >= 0) & shown.certain[last])[:, None], shown.velocity.value[last], leads)
+def _before(signal: Signal, steps: Steps) -> Floats:
+    """(T, ...) last sample before each step, 0 where there is none."""
+    last = np.searchsorted(signal.t, steps.grid - 0.5 * steps.dt - SAME_INSTANT) - 1
+    return np.where(last >= 0, signal.value.T[..., last], 0.0).T
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
