@@ -26,9 +26,9 @@ def test_noise_of_fixes_need_not_be_known(std):
 
 
 def test_bad_settings_are_named(crossing):
-    for shape in ((2, 3), (9, 1, 3)):
+    for x0 in (np.zeros((2, 3)), np.zeros((9, 1, 3)), np.full((1, 3), np.nan)):
         with refused("^x0 = "):
-            Kalman(x0=np.zeros(shape))(gaps(crossing))
+            Kalman(x0=x0)(gaps(crossing))
     with refused("^velocity_floor = "):
         Kalman(NoiseModel.nominal(Sensors(velocity_floor=0.0)))(gaps(crossing))
 

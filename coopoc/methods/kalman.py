@@ -176,12 +176,13 @@ def solo_track(
 
 
 def start_of(x0: Floats | None, fixes: Floats) -> Floats:
-    """A known start x0 (R, E, 3) or (E, 3) m, else the first fixes (R, E, 3) m; InputError for another shape."""
+    """A known start x0 (R, E, 3) or (E, 3) m, else the first fixes (R, E, 3) m; InputError for another shape or NaN."""
     if x0 is None:
         return fixes
-    if np.shape(x0) not in (fixes.shape, fixes.shape[1:]):
-        allowed = f"must be (R, E, 3) = {fixes.shape} or (E, 3)"
-        raise InputError("x0", f"shape {np.shape(x0)}", allowed, "Give one position per ego.")
+    actual = f"shape {np.shape(x0)}" if np.isfinite(x0).all() else "not finite"
+    if actual not in (f"shape {fixes.shape}", f"shape {fixes.shape[1:]}"):
+        allowed = f"must be finite, (R, E, 3) = {fixes.shape} or (E, 3)"
+        raise InputError("x0", actual, allowed, "Give one position per ego.")
     return np.broadcast_to(x0, fixes.shape)
 
 
