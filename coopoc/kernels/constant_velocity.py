@@ -48,7 +48,8 @@ def constant_velocity(
         bank: (F,) w.
     """
     count, models = len(t), len(bank)
-    velocity, growth, spread, proved = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count)
+    velocity = np.zeros((count, 3))
+    growth, spread, proved = np.zeros((3, count))
     x, u, p, score = np.zeros((4, models, 3))
     v, best, prior = np.zeros(3), FIRST_FILTER, PRIOR_COUNT
     score[:, 0], score[:, 1] = prior, prior * variance

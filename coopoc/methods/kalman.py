@@ -56,11 +56,8 @@ class FilterStream:
 
     def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
-        self._state, self._given, self._noise = (
-            np.full(len(STATE), np.nan),
-            np.zeros(8),
-            np.hstack((*motion, *fixes)),
-        )
+        self._state, self._given = np.full(len(STATE), np.nan), np.zeros(8)
+        self._noise = np.hstack((*motion, *fixes))
         self._odometry = new_state(motion) if fixes.gate > 0.0 else np.empty((0, 0))
         if x0 is not None:
             self._state[:] = STATE
@@ -225,6 +222,6 @@ def solo_filter(
     inputs = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), variance, columns, recording.dt)
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
     x, p = np.empty(size), np.empty(size)
-    if x0 is not None:
+    if first:
         x[:, 0] = start_of(x0, gnss[:, 0, columns])
-    return x, p, run_filter(inputs, fixes.gate, x0 is not None, index, x, p)
+    return x, p, run_filter(inputs, fixes.gate, first > 0, index, x, p)

@@ -71,8 +71,7 @@ def observe(
     fleet, sensors = instance("fleet", fleet, Fleet), instance("sensors", sensors, Sensors)
     v2x = V2X() if v2x is None else instance("v2x", v2x, V2X)
     seed = seed_of(seed)
-    observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
-    watching = tuple(sorted(set(observing)))
+    watching = range(len(fleet.ids)) if observers is None else sorted({*columns("observers", observers, fleet.ids)})
     one_of("frame", frame, Frame)
     assumed = sensors.assumable() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
@@ -86,6 +85,10 @@ def observe(
     gnss[:, :, standing] = fleet.position[:, standing]
     relative = _relative_measurements(fleet, links, sensors, v2x, runs, seed, remove_outliers)
     body, moved = None, fleet.velocity
+    notes = [f"{note}{', removed' * remove_outliers}" for note in (sensors.outliers.notes if sensors.outliers else ())]
+    # By more than stops within long steps explain, and 0.5 m/s.
+    if np.nansum(abs(np.diff(fleet.position, axis=0) / fleet.dt - moved[1:])) > np.nansum(abs(moved) + 0.5):
+        notes.append("velocities of the fleet contradict its positions: they are in m/s, of the same instants")
     if frame == "world":
         velocity = _noisy(fleet, "velocity", runs, seed, moved, sensors.velocity_std(moved))
     else:
@@ -95,8 +98,6 @@ def observe(
         wrong_odometry(velocity, moved, fleet, sensors.outliers, seed, remove_outliers)
     for array in (gnss, velocity, relative):
         array.flags.writeable = False  # so that the Recording need not copy them
-    wrong = sensors.outliers.notes if sensors.outliers else ()
-    notes = tuple(f"{note}{', removed' * remove_outliers}" for note in wrong)
     return Recording(
         ids=fleet.ids,
         t=fleet.t,
@@ -108,8 +109,8 @@ def observe(
         arrival=arrival,
         sensors=assumed,
         v2x=v2x,
-        observers=watching,
-        notes=notes,
+        observers=tuple(watching),
+        notes=tuple(notes),
         body=body,
         landmarks=tuple(standing),
     )

@@ -254,8 +254,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2))
     wander = _wander(heading, moves, steps)
     if by_fixes:  # at first a velocity is less certain than later, all the way to the next fix
-        unsure = _before(Signal(fixes.t, shown.std), steps)
-        wander = np.maximum(wander, np.ptp(fixes.t) / len(fixes.t) * unsure**2)
+        wander = np.maximum(wander, np.ptp(fixes.t) / len(fixes.t) * _before(Signal(fixes.t, shown.std), steps) ** 2)
     climbs = 0.0 if flat or by_fixes or rows["kind"].isin(("vz", "vz_body")).any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
@@ -391,7 +390,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
         none = np.zeros(len(t))
         return Shown(Signal(t, np.zeros_like(x)), none > 0, 0.0, none)
     apart = np.diff(t)
-    interval, longest = float(np.median(apart)), np.quantile(apart, 0.9)
+    interval = float(np.median(apart))
     velocity, growth, spread, proved = constant_velocity(
         t, x, interval, steps.gap(t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
     )
@@ -401,7 +400,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     learned = begun & (t > t[0] + REMEMBERS)
     grown = (growth * np.maximum(proved, variance))[learned if learned.any() else begun]
     wanders = float(grown.mean() / interval) if len(grown) else 0.0
-    certain = (since > 3) | (sure & (spread * longest**2 < 2.0))
+    certain = (since > 3) | (sure & (spread * np.quantile(apart, 0.9) ** 2 < 2.0))
     return Shown(Signal(t, velocity), certain, wanders, np.sqrt(proved * spread))
 
 
