@@ -164,7 +164,7 @@ def gather_evidence(state: Floats, dt: float) -> None:
     state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / SPEED_MEMORY_S, 0.0), speed2)
     q = state[BASE] + interval**2 * max(state[RATIO] * speed2, state[FLOOR] ** 2)
     q *= UNKNOWN * time / interval
-    p, pb, bb = state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2]
+    p, pb, bb = state[VARIANCE:BELIEVED]
     p += 2.0 * time * pb + time * time * bb + state[WALK] * time**3 / 3.0 + q
     pb, bb = pb + time * bb + 0.5 * state[WALK] * time * time, bb + state[WALK] * time
     sure = max(state[SURE_UNTIL] + q, r * min(weight / state[FINEST], 1.0) * time / WANDERS)
@@ -189,7 +189,7 @@ def gather_evidence(state: Floats, dt: float) -> None:
         state[ERROR + c] += 0.0 if anew else gain * gap
         state[BELIEVED + c] += trust * state[WAY + c]
     bb = max(bb, state[SPEED]) if anew else bb - gain * pb
-    state[VARIANCE], state[VARIANCE + 1], state[VARIANCE + 2] = share * r, (1.0 - share) * pb, bb
+    state[VARIANCE:BELIEVED] = share * r, (1.0 - share) * pb, bb
     state[SURE_UNTIL] = trust * r
     state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, MAX_Q) - 1.0)), 1.0)
     state[LIKELY] = LIKELY_KEPT * state[LIKELY] - 0.5 * min(square, MAX_Q) - log(s)
