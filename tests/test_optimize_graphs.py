@@ -339,7 +339,7 @@ def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps, un
 
 @DIMENSIONS
 def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension):
-    """Half a chi-square, whose angles count twice in the plane, but for what they hold beside accurate positions; mean
+    """Closed form: half a chi-square; in the plane angles count twice, but for what they hold beside positions; mean
     and spread over 40 graphs."""
     found, mean, variance = [], 0.0, 0.0
     for seed in range(40):
