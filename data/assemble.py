@@ -237,7 +237,8 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
             f"{file}: column t with dt = {dt:g} s",
             f"{steps:.3g} steps of {vehicles} vehicles for {rows} rows",
             f"must be at most {MAX_INSTANTS_PER_ROW} instants a row",
-            "Check that t is in seconds (not nanoseconds or milliseconds), or take a longer dt.",
+            "Check that t is in seconds (not nanoseconds or milliseconds) and the same for all numbers of a sample, or "
+            "take a longer dt.",
         )
 
 

@@ -12,6 +12,7 @@ from shell import ROOT
 from strange_logs import strange
 
 import coopoc as co
+from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import kind_of
 from coopoc.data.registry import read_log as load_log
@@ -197,6 +198,16 @@ def test_what_does_not_fit_is_counted_with_its_place(tmp_path, case):
     number, place = refused[found]
     assert number == 1
     assert place.startswith("log.csv: row ")
+
+
+def test_numbers_of_a_fix_with_other_stamps_are_named(tmp_path):
+    """20 us apart, of half the fixes of one, and of all."""
+    file = tmp_path / "log.csv"
+    file.write_text(re.sub(r"(?m)^(0\.\d)(,blue,y)", r"\g<1>0002\2", GOOD))
+    assert "stamps of x, y of blue differ" in str(check(read_log(file)).warnings)
+    file.write_text(re.sub(r"(\.\d)(,blue,y)", r"\g<1>0002\2", GOOD))
+    with refused("row 6, fixes of blue = never x, y .* at one time"):
+        read_log(file)
 
 
 def same(a, b):

@@ -41,7 +41,7 @@ from .estimates import (
     ratio_of_moves,
     worst,
 )
-from .motion import HOLDS, OTHER_RATES
+from .motion import HOLDS, INCOMPLETE, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
 from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
 from .residuals import Check, filtered, without, without_wild
@@ -53,14 +53,12 @@ WRONG_UNITS = (
     (3.0, 3.6, "Are positions in feet? They are in m."),
 )
 """Ratios of the distance of fixes to that of odometry (least, largest), and the unit that explains them."""
-LEAST_FIXES, FRAME_STDS = 5, 1.5
-"""Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
+FRAME_STDS = 1.5
+"""Standard deviations of a fix that a difference of frames must have."""
 OFFSET_ERRORS = 6.0
 """Standard errors of an offset beyond which it is significant."""
 LEAST_ARM, LONGEST_ARM = 0.2, 30.0
 """m, least arm of an antenna that is reported, and longest that is one."""
-UNUSED_SHARE = 0.05
-"""Share of the logged rows that may be left out without a sentence."""
 AXIS_TURN = 20.0
 """Degrees by which odometry is turned from which its forward axis is another."""
 JUMP_NIS = 1e3
@@ -73,8 +71,8 @@ DIVERGED = 0.3
 """Scale error of odometry beyond which the filter that estimates it has diverged."""
 USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
-EXPECTED = "steps of", "fixes and relative measurements that hold"
-"""Beginnings of reasons that are no fault of the log."""
+EXPECTED = "steps of", "fixes and relative measurements that hold", INCOMPLETE
+"""Beginnings of reasons that are no fault of the log, or named of each vehicle."""
 FAULTS = "stamps of", "fixes far from", SEVERAL.split("{")[0], OTHER_RATES.split("{")[0]
 """Beginnings of what is assumed that is a fault."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."

@@ -50,6 +50,10 @@ HOLDS = "fixes that repeat while the odometry moves"
 OTHER_RATES = "yaw rates are read as rad/s anticlockwise, which fixes of {} contradict: scale=yaw_rate:"
 NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is estimated from its past fixes"
 
+INCOMPLETE = "incomplete rows"
+UNUSED_SHARE, LEAST_FIXES = 0.05, 5
+"""Share of what was logged that may be left out without a sentence; samples of which one says something."""
+
 VELOCITIES = ("vx", "vy", "vz")
 
 
@@ -149,8 +153,14 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
     rows, needed = only(rows, *names), list(names[:required])
     table = rows.pivot(index="t", columns="kind", values="value").reindex(columns=list(names))
     whole = table[needed].notna().all(axis=1)
-    reason = f"incomplete rows, without all of {', '.join(needed)} at one time"
-    summary.refuse(reason, only(rows[rows["t"].isin(table.index[~whole])], *needed))
+    lost, kinds = only(rows[rows["t"].isin(table.index[~whole])], *needed), ", ".join(needed)
+    summary.refuse(f"{INCOMPLETE}, without all of {kinds} at one time", lost)
+    if len(lost) > max(LEAST_FIXES, UNUSED_SHARE * len(only(rows, *needed))):
+        summary.assume(
+            f"stamps of {kinds} of {{}} differ, and over {UNUSED_SHARE:.0%} of these are not used: give all numbers of "
+            "a sample the same t, rounded if need be",
+            rows["vehicle"].iloc[0],
+        )
     return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
 
 
@@ -167,12 +177,19 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         arm: (3,) m forward, left, up to the antenna; None: fixes are those of the reference point.
 
     Raises:
-        InputError: neither odometry nor two fixes, a speed or an arm without a heading; in body frames no speed or yaw
-            rate.
+        InputError: no fix is whole, neither odometry nor two fixes, a speed or an arm without a heading; in
+            body frames no speed or yaw rate.
     """
     grid, summary, body = steps.grid, steps.summary, steps.body
     flat = steps.planar or not rows["kind"].eq("z").any()
     fixes = samples(rows, ("x", "y", "z"), summary, 2 if flat else 3)
+    if not len(fixes.t) and len(parts := only(rows, "x", "y")):
+        raise InputError(
+            f"{row_of(parts)}, fixes of {name}",
+            "never x, y (and z) at one time",
+            "must have equal stamps",
+            "Give all numbers of a fix the same t, rounded if need be.",
+        )
     if flat:
         fixes.value[:, 2] = 0.0
     if flat and not steps.planar:
