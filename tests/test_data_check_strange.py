@@ -290,3 +290,15 @@ def test_errors_that_last_are_no_fault_and_small_lags_are(tmp_path, fault, words
         tables.append(star(t + late * (fault == "a clock"), rng, name, x, u, seen))
     pd.concat(tables).to_csv(tmp_path / "log.csv")
     assert re.match(words, said(tmp_path), re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(lambda log: {"speed": log["speed"] * np.where(log["vehicle"] == "car1", -1, 1)}, r"scale=car1\.speed:-1")],
+)
+def test_faults_that_pose_filters_hide_are_named(tmp_path, change, words):
+    """A filter turns its headings until fixes agree, and gates outliers."""
+    folder = strange(tmp_path / "log", "car", 1, 60.0)
+    log = pd.read_csv(folder / "log.csv").drop(columns=["heading", "heading_std"])
+    log.assign(**change(log)).to_csv(folder / "log.csv")
+    assert re.fullmatch(f"car1: .*{words}.*", said(folder, "frame=body"))

@@ -312,7 +312,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         say(
             f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
             f"look turned by {-turn:.0f} deg. Speeds are positive forward, headings anticlockwise from +x (east), "
-            "rad; clockwise from north in degrees is compass_deg."
+            f"rad; clockwise from north in degrees is compass_deg. At 180, scale={name}.speed:-1 (or of .vx and .vy)."
         )
     elif turn is not None and (may := _may(row, "turned", LEAST_TURN)):
         say(

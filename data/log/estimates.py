@@ -185,9 +185,12 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     """(5, M) displacements m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
     that stands still, the fixes) moves far; by what velocity and acceleration change over a span, as fixes are off that
     are late, or smoothed; and how long it is, s. M = 0 where too little moves. On a short way the means of several
-    fixes are less noisy."""
-    rec = c.world
+    fixes are less noisy. In body frames true headings direct the odometry: a filter turns its own until fixes agree."""
+    rec, truth = c.world, c.log.truth
     fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
+    if c.log.recording.body is not None and truth is not None and truth.heading is not None:
+        along = plane(c.log.recording.velocity[0, :, column]) * np.exp(1j * truth.heading[:, column])
+        velocity = along if np.isfinite(along).any() else velocity
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     walk = rec.dt * np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor))
     at = np.flatnonzero(np.isfinite(fixes))
