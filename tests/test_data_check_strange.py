@@ -294,7 +294,10 @@ def test_errors_that_last_are_no_fault_and_small_lags_are(tmp_path, fault, words
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [(lambda log: {"speed": log["speed"] * np.where(log["vehicle"] == "car1", -1, 1)}, r"scale=car1\.speed:-1")],
+    [
+        (lambda log: {"speed": log["speed"] * np.where(log["vehicle"] == "car1", -1, 1)}, r"scale=car1\.speed:-1"),
+        (lambda log: {"x": log["x"] + 80 * ((log["vehicle"] == "car1") & (log["t"] % 7 > 6))}, "13.8% .* outliers"),
+    ],
 )
 def test_faults_that_pose_filters_hide_are_named(tmp_path, change, words):
     """A filter turns its headings until fixes agree, and gates outliers."""

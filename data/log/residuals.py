@@ -148,7 +148,7 @@ def without_wild(c: Check) -> Check:
         at = np.flatnonzero(np.isfinite(c.fix[:, column, 0]))
         gap, off = plane(c.fix[at, column]), wild[at, column]
         wild[at[:-1], column] &= ~(off[1:] & ((gap[:-1] * gap[1:].conj()).real > 0))
-    if rec.body is not None or not wild.any():
+    if not wild.any():
         return c
     less = replace(rec, gnss=np.where(wild[..., None], nan, rec.gnss))
     return replace(filtered(replace(c.log, recording=less)), wild=wild.sum(0), failing=c.failing)
