@@ -356,7 +356,7 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
         ("wheels", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
         ("wheels in km/h", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
         ("current", r"(offset=a\.vx:-0\.[23]\d*,a\.vy:\S+) takes it off"),
-        ("tunnel", r"a: its fixes are off by \d\S+ times its standard deviation from [67]\d\d s on"),
+        ("tunnel", r"a: its fixes are off by up to \d\S+ times its standard deviation from [67]\d\d to 8\d\d s"),
     ],
 )
 def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words):

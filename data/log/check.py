@@ -41,7 +41,7 @@ from .estimates import (
     ratio_of_moves,
     worst,
 )
-from .motion import HOLDS, INCOMPLETE, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
+from .motion import HOLDS, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
 from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
 from .residuals import Check, filtered, without, without_wild
@@ -71,7 +71,7 @@ DIVERGED = 0.3
 """Scale error of odometry beyond which the filter that estimates it has diverged."""
 USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
-EXPECTED = "steps of", "fixes and relative measurements that hold", INCOMPLETE
+EXPECTED = "steps of", "fixes and relative measurements that hold", "incomplete rows"
 """Beginnings of reasons that are no fault of the log, or named of each vehicle."""
 FAULTS = "stamps of", "fixes far from", SEVERAL.split("{")[0], OTHER_RATES.split("{")[0]
 """Beginnings of what is assumed that is a fault."""
@@ -169,7 +169,8 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         if truth is not None:
             row["fix_error_m"] = _rms(rec.gnss[0, :, column] - truth.position[:, column])
             row["error_m"] = _rms(c.x[:, column] - truth.position[:, column])
-        row["misses"], row["per_std"], row["worst_at_s"] = worst(c, column)
+        row["misses"], row["per_std"], times = worst(c, column)
+        row["worst_from_s"], row["worst_to_s"] = times.min(), times.max()
         rows.append(row)
     return rows
 
@@ -247,8 +248,7 @@ def _of_rows(c: Check) -> Iterator[str]:
         first = summary.refused[why][1]
         yield (
             f"{share:.0%} of what was logged is not used, mostly {left[why]} {why}"
-            + f" (first: {first})" * bool(first)
-            + f". {hint}".rstrip(" ")
+            f"{f' (first: {first})' * bool(first)}. {hint}".rstrip(" ")
         )
     yield from (f"{sentence}." for sentence in summary.sentences if sentence.startswith(FAULTS))
     if summary.unread:
@@ -260,12 +260,13 @@ def _of_filters(c: Check, named: Sequence[str]) -> Iterator[str]:
     do at once."""
     explained = {one.partition(": ")[0] for one in named if MAY not in one}
     rows = [row for row in sorted(c.vehicles, key=lambda row: -row["per_std"]) if row["per_std"] > CONFIDENT_RATIO]
-    begins = [row["worst_at_s"] for row in rows]
+    begins = [row["worst_from_s"] for row in rows]
     for row in rows:
         if row["misses"] == "filter errs" or row["vehicle"] not in explained:
             yield (
-                f"{row['vehicle']}: its {row['misses']} by {row['per_std']:.1f} times its standard deviation from "
-                f"{row['worst_at_s']:.3g} s on: see the other lines, or the stated noise is wrong."
+                f"{row['vehicle']}: its {row['misses']} by up to {row['per_std']:.1f} times its standard deviation "
+                f"from {row['worst_from_s']:.3g} to {row['worst_to_s']:.3g} s: see the other lines, or the stated "
+                "noise is wrong."
             )
     usual = pd.Series(c.normalised.ravel()).median() < CONFIDENT_RATIO  # else the noise is understated throughout
     if usual and len(rows) == len(c.vehicles) > 1 and np.ptp(begins) < 0.2 * np.ptp(c.world.t):

@@ -177,8 +177,8 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
 def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     """What is of each step, of the one two samples of the odometry later, as two steps may share one; the last at the
     end."""
-    later = 2 * max(round(c.log.summary.odometry / c.world.dt), 1)
-    return of_step.take(np.arange(of_step.shape[axis]) + later, axis, mode="clip")
+    at = np.arange(of_step.shape[axis]) + 2 * max(round(c.log.summary.odometry / c.world.dt), 1)
+    return of_step.take(at, axis, mode="clip")
 
 
 def moves(c: Check, column: int, means: int = 1) -> AnyArray:
@@ -186,11 +186,11 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     that stands still, the fixes) moves far; by what velocity and acceleration change over a span, as fixes are off that
     are late, or smoothed; and how long it is, s. M = 0 where too little moves. On a short way the means of several
     fixes are less noisy. In body frames true headings direct the odometry: a filter turns its own until fixes agree."""
-    rec, truth = c.world, c.log.truth
+    rec = c.world
     fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
-    if c.log.recording.body is not None and truth is not None and truth.heading is not None:
-        along = plane(c.log.recording.velocity[0, :, column]) * np.exp(1j * truth.heading[:, column])
-        velocity = along if np.isfinite(along).any() else velocity
+    heading = getattr(c.log.truth, "heading", None)
+    if c.log.recording.body and heading is not None and np.isfinite(heading[:, column]).any():
+        velocity = plane(c.log.recording.velocity[0, :, column]) * np.exp(1j * heading[:, column])
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     walk = rec.dt * np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor))
     at = np.flatnonzero(np.isfinite(fixes))
@@ -425,21 +425,17 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
     marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (c.still & ~truth.present.any(0))
     off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
-    on_time = ~np.isin(rec.ids, late)
-    x = np.where(marks[:, None], c.x, np.where((fits & on_time)[:, None], truth.position, nan))
+    x = np.where(marks[:, None], c.x, np.where((fits & ~np.isin(rec.ids, late))[:, None], truth.position, nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
     if c.log.recording.body is None:
         stated[1] = noise.world_azimuth_std
     else:
         turned = rec.relative[0, :, 1] - c.log.recording.relative[0, :, 1]
-        known = np.full(rec.gnss[0, ..., 0].shape, nan) if truth.heading is None else truth.heading
+        known = nan * c.variance[..., 0] if truth.heading is None else truth.heading
         residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
-    used = np.isfinite(residual)
-    relative = np.where(used, residual, c.relative)
-    fit = (fits | marks | ~on_time)[[rec.links.observer, rec.links.neighbour]].all(0)
-    relative[~fit] = nan  # of others nothing is known
-    x = np.where(np.isfinite(x), x, c.x)
-    return replace(c, x=x, relative=relative, expected=np.where(used, stated, c.expected))
+    used, x = np.isfinite(residual), np.where(np.isfinite(x), x, c.x)
+    expected = np.where(used, stated, c.expected)
+    return replace(c, x=x, relative=np.where(used, residual, c.relative), expected=expected)
 
 
 def on_time(c: Check, alike: bool, true: Check) -> Check:
@@ -461,10 +457,10 @@ def on_time(c: Check, alike: bool, true: Check) -> Check:
     return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], ranges=ranges)
 
 
-def worst(c: Check, column: int) -> tuple[str, float, float]:
+def worst(c: Check, column: int) -> tuple[str, float, Floats]:
     """What a vehicle's filter misses by over CONFIDENT_RATIO of the deviations that it states: positions of a truth in
-    a tenth of the drive, else fixes, or these the truth, in one or alone, where that is beyond chance; by how many; and
-    from when on, s."""
+    a tenth of the drive, else fixes, or these the truth, in one or alone, where that is beyond chance; by how many at
+    most; and when, s."""
     rec, truth = c.world, c.log.truth
     size, t, squares = dimensions(rec), rec.t - rec.t[0], pd.Series(c.normalised[:, column]).dropna()
     tenths, fixes = np.arange(len(t)) * TENTHS // len(t), (rec.gnss[0], np.square(rec.fix_scale * rec.sensors.fix_std))
@@ -476,9 +472,9 @@ def worst(c: Check, column: int) -> tuple[str, float, float]:
             )
             ratios = (off / usual)[usual > 0.0] ** 0.5
             if ratios.max() > CONFIDENT_RATIO:
-                return what, float(ratios.max()), float(t[tenths == ratios.idxmax()][0])
+                return what, float(ratios.max()), t[np.isin(tenths, ratios.index[ratios > CONFIDENT_RATIO])]
     parts = squares.groupby(tenths[squares.index])
-    square = pd.concat([pd.Series([0.0]), squares, parts.transform("mean")])
-    count = np.r_[1, np.ones(len(squares)), parts.transform("size")]
-    beyond = square.where(size * count * square > scipy.stats.chi2.isf(RARE, size * count), 0.0)
-    return "fixes are off" * bool(beyond.any()), float(beyond.max() ** 0.5), float(t[beyond.idxmax()])
+    square = pd.concat([squares, parts.transform("mean")])
+    count = np.r_[np.ones(len(squares)), parts.transform("size")]
+    beyond = square[size * count * square > scipy.stats.chi2.isf(RARE, size * count)]
+    return ("fixes are off", float(beyond.max() ** 0.5), t[beyond.index]) if len(beyond) else ("", 0.0, t)

@@ -50,7 +50,6 @@ HOLDS = "fixes that repeat while the odometry moves"
 OTHER_RATES = "yaw rates are read as rad/s anticlockwise, which fixes of {} contradict: scale=yaw_rate:"
 NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is estimated from its past fixes"
 
-INCOMPLETE = "incomplete rows"
 UNUSED_SHARE, LEAST_FIXES = 0.05, 5
 """Share of what was logged that may be left out without a sentence; samples of which one says something."""
 
@@ -154,7 +153,7 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
     table = rows.pivot(index="t", columns="kind", values="value").reindex(columns=list(names))
     whole = table[needed].notna().all(axis=1)
     lost, kinds = only(rows[rows["t"].isin(table.index[~whole])], *needed), ", ".join(needed)
-    summary.refuse(f"{INCOMPLETE}, without all of {kinds} at one time", lost)
+    summary.refuse(f"incomplete rows, without all of {kinds} at one time", lost)
     if len(lost) > max(LEAST_FIXES, UNUSED_SHARE * len(only(rows, *needed))):
         summary.assume(
             f"stamps of {kinds} of {{}} differ, and over {UNUSED_SHARE:.0%} of these are not used: give all numbers of "
@@ -261,9 +260,10 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if fixed.any() or not body:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
         there &= fixed
-    span = "throughout" if there.all() else f"{there.mean():.0%} of the time{_longest(there, grid)}"
-    text = f"{len(fixes.t)} fixes, {len(signals[0].t) * (not by_fixes)} samples of odometry, "
-    text += f"{len(measured.t)} headings, {span}"
+    text = (
+        f"{len(fixes.t)} fixes, {len(signals[0].t) * (not by_fixes)} samples of odometry, {len(measured.t)} headings, "
+        f"{'throughout' if there.all() else f'{there.mean():.0%} of the time{_longest(there, grid)}'}"
+    )
     absent, compass = np.where(there, 0.0, nan), none
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
