@@ -163,8 +163,7 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
     between = (
         (at >= t[left] - SAME_INSTANT) & (at <= t[right] + SAME_INSTANT) & (t[right] - t[left] <= gap + SAME_INSTANT)
     )
-    near = np.minimum(abs(at - t[left]), abs(at - t[right])) <= edge + SAME_INSTANT
-    return between | near
+    return between | (np.minimum(abs(at - t[left]), abs(at - t[right])) <= edge + SAME_INSTANT)
 
 
 def check_scale(paths: Sequence[tuple[Floats, Floats]], file: str) -> None:

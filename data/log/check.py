@@ -134,9 +134,9 @@ def _wider(c: Check) -> Check:
     """The same, where fixes err by more than is stated: so do the positions of these vehicles."""
     links, nis = c.world.links, {row["vehicle"]: row["nis"] for row in c.vehicles if _beyond(row, "nis", OUTLYING)}
     factor = np.array([nis.get(name, 1.0) for name in c.world.ids])
-    more = factor[np.stack([links.observer, links.neighbour])].mean(0)
+    more = factor[np.stack([links.observer, links.neighbour])].mean(0)[:, None]
     noise = np.square(c.world.sensors.relative_std)
-    return replace(c, expected=np.sqrt((c.expected**2 - noise) * more[:, None] + noise))
+    return replace(c, expected=np.sqrt((c.expected**2 - noise) * more + noise))
 
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
@@ -435,11 +435,10 @@ def _of_fixes(c: Check) -> Iterator[str]:
     for column, name in enumerate(rec.ids):
         row = next((row for row in c.vehicles if row["vehicle"] == name), {})
         finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
-        every_one = np.zeros(finite.sum(), int)
         shown = truth is None and c.shown(column)
         for share in ([1, 1, 1], [0, 0, 1])[shown:]:  # without an arm that is sure a clock may explain it all
             x, z = (each[:, finite, column].T * share for each in (made, then))
-            factor, std = factors(off[finite, column], x, usual, every_one, z=z)
+            factor, std = factors(off[finite, column], x, usual, np.zeros(len(x), int), z=z)
             sure = abs(factor) > OFFSET_ERRORS * std
             arm = (sure & (abs(factor) > LEAST_ARM))[:2].any() and abs(factor[:2]).max() < LONGEST_ARM
             if arm:
@@ -476,8 +475,8 @@ def _of_fixes(c: Check) -> Iterator[str]:
                 f"{name}: fixes lie {up[0]:.3g} m above the truth in the median. Is one of the two above the "
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
-        unsure = min(OFFSET_ERRORS * np.hypot(east[1], north[1]), FRAME_STDS * usual)
-        if np.hypot(east[0], north[0]) > max(unsure, usual / 2):
+        away, unsure = np.hypot(east, north)
+        if away > max(min(OFFSET_ERRORS * unsure, FRAME_STDS * usual), usual / 2):
             theirs = norm(rec.gnss[0, :, column, None, :2] - truth.position[..., :2], axis=-1)
             like = [one for one, far in zip(rec.ids, pd.DataFrame(theirs[both]).median(), strict=True) if far < usual]
             hint = "Has it another frame? Fixes in degrees are local at the first: give origin= of the truth, or it in "

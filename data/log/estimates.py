@@ -168,9 +168,8 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
         return plane(rec.gnss[0] - truth.position), made, made
     then = np.nan_to_num(following(c, made, axis=1))
     for k, cause in enumerate(np.nan_to_num(NUDGE_STEP * made)):
-        gnss = c.log.recording.gnss + in_space(cause)
-        moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
-        made[k] = plane(moved.fix - c.fix) / NUDGE_STEP
+        moved = replace(c.log.recording, gnss=c.log.recording.gnss + in_space(cause))
+        made[k] = plane(filtered(replace(c.log, recording=moved)).fix - c.fix) / NUDGE_STEP
     return plane(c.fix), made, then
 
 
@@ -199,14 +198,13 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     pace = np.gradient(path, rec.dt)
     numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(2)
     (fixes, path), gaps, at = numbers[:2], gaps[parts[:, 0]], parts[:, 0]
-    times = MOVED_STDS if means == 1 else MOVED_STDS / 3
-    noise = c.fix_noise / means**0.5
-    for places, far in ((path, times), (fixes, 2 * times)):
+    least = (MOVED_STDS if means == 1 else MOVED_STDS / 3) * c.fix_noise / means**0.5
+    for places, far in ((path, least), (fixes, 2 * least)):
         pairs, last = [], 0
         for k in range(1, len(at)):
             if gaps[k] != gaps[last]:
                 last = k
-            elif abs(places[k] - places[last]) > max(far * noise, OUTLYING * walk * (at[k] - at[last]) ** 0.5):
+            elif abs(places[k] - places[last]) > max(far, OUTLYING * walk * (at[k] - at[last]) ** 0.5):
                 pairs.append((last, k))
                 last = k
         if len(pairs) >= 3:
@@ -245,14 +243,13 @@ def odometry(c: Check, column: int) -> Estimate:
         if each.shape[1] < LEAST_COUNT:
             each = moves(c, column, max(int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * LEAST_COUNT // 2), 1))
         moved, driven, turns, bends, span = each
-        square = max(np.square(abs(driven)).sum(), 1e-12)
         causes = np.stack([driven, 1j * driven, turns, bends])
         y = moved - driven
         if rec.ids[column] in c.log.summary.assumed.get(COURSE.format("{}", "fixes"), ()):
             along = driven.conj() / abs(driven)  # across, a heading that is derived follows the fixes
             y, causes, span = (y * along).real + 0j, (causes * along).real + 0j, 0.0 * span
         value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
-        attenuation = (norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
+        attenuation = (norm(noise) * rec.dt / max(norm(driven), 1e-6)) ** 2  # by noise of the cause
         turned = (1 + complex(*value[:2])) * (1 + attenuation)
         if abs(turned.real) < LEAST_FORWARD:
             return none
@@ -266,8 +263,8 @@ def odometry(c: Check, column: int) -> Estimate:
     odometer = velocity @ [1, 1j]
     if body is not None:
         odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
-        heading = None if truth.heading is None else truth.heading[:, column]
-        true = (abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
+        along = abs(true) if truth.heading is None else (true * np.exp(-1j * truth.heading[:, column])).real
+        true = along.astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)])
     used = np.isfinite(odometer + x.sum(0))
     pace = np.maximum(abs(true), abs(odometer))
@@ -277,8 +274,7 @@ def odometry(c: Check, column: int) -> Estimate:
     forward = 1 + value[0]
     late = -value[2] / forward if abs(forward) > LEAST_FORWARD else inf
     value[:3] = *_polar(1 + complex(*value[:2])), late
-    sure = abs(late) < LONG_LAG  # what is linear in a lag holds for small ones
-    error[2] = error[2] / abs(forward) if sure else inf
+    error[2] = error[2] / abs(forward) if abs(late) < LONG_LAG else inf  # what is linear in a lag holds for small ones
     if body is not None:
         error[1] = inf
         if truth.heading is not None:
@@ -362,9 +358,9 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
 
 def share(c: Check) -> float:
     """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
-    fixes, noise = np.isfinite(c.normalised).sum(0), np.square(c.world.sensors.fix_std[:2]).mean()
     variance = pd.DataFrame(c.variance[..., :2].mean(2)).mean()
-    ratio = (variance + noise) / (variance * fixes).clip(1e-12)
+    ratio = variance + np.square(c.world.sensors.fix_std[:2]).mean()
+    ratio /= (variance * np.isfinite(c.normalised).sum(0)).clip(1e-12)
     return min(2.0 * float(ratio.where(variance > 0.0, 0.0).max()), 1.0)
 
 
