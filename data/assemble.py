@@ -103,8 +103,8 @@ def assemble(
             "must be present at consecutive instants",
             "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out.",
         )
-    u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
-    return Fleet(ids, grid, table[..., :3], u, name=name, source=source)
+    x, u = table[..., :3], table[..., 3:]
+    return Fleet(ids, grid, x, u if u.size else backward_difference(grid, x, ids, file), name=name, source=source)
 
 
 def longest_gap(t: Floats, dt: float, max_gap: float | None) -> float:
@@ -186,8 +186,12 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
         each = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, south), (east, north) = places.min(0).tolist(), places.max(0).tolist()
-    near = max(east - west, north - south) < REGION
-    if 0 < speed < MIN_TYPICAL_SPEED and near and max(-west, east) <= 360 and max(-south, north) <= 180:
+    if (
+        0 < speed < MIN_TYPICAL_SPEED
+        and max(east - west, north - south) < REGION
+        and max(-west, east) <= 360
+        and max(-south, north) <= 180
+    ):
         raise InputError(
             f"{file}: columns x, y",
             f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}",

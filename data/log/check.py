@@ -210,7 +210,7 @@ def _axes(c: Check, column: int) -> str:
             " deg from +x. At 45, swap easting and northing, latitude and longitude, or vx and vy; headings clockwise "
             "from north are compass_deg. At 0, change the sign of y or vy; at +-90, of x or vx."
         )
-    if np.square(u[:, 1]).mean() < 0.01 * np.square(u[:, 0]).mean():
+    if norm(u[:, 1]) < 0.1 * norm(u[:, 0]):
         return (
             "vx, vy look like a body-frame velocity: along +x throughout, while the fixes turn. Name vx speed, and log "
             "a heading or a yaw_rate."
@@ -221,14 +221,14 @@ def _axes(c: Check, column: int) -> str:
 def _noisier(c: Check, column: int) -> str:
     """When fixes scatter far more than is stated and than they do else: second differences of what they are beside the
     odometry, which slips hardly change; nothing where none do."""
-    rec, t = c.world, c.world.t - c.world.t[0]
+    rec = c.world
     path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, 0)
     off = pd.DataFrame((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[[0, 1]].dropna()
     size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / (c.fix_noise * (6 * np.log(2)) ** 0.5)
     scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated
     if len(off) < TENTHS * LEAST_COUNT / 2 or scatter.max() < CONFIDENT_RATIO * max(1.0, scatter.median()):
         return ""
-    at = t[off.index[size > 0.5 * scatter.max()]]
+    at = (rec.t - rec.t[0])[off.index[size > 0.5 * scatter.max()]]
     return (
         f"its fixes scatter by {scatter.max():.2g} times their standard deviation from {at[0]:.3g} to {at[-1]:.3g} s: "
         "did the receiver lose its base or satellites? Give columns of std, or leave these fixes out."
@@ -243,7 +243,7 @@ def _of_rows(c: Check) -> Iterator[str]:
     share = max(used / max(used + sum(summary.read.values()), 1), sum(left.values()) / (summary.rows or inf))
     held = left.get(HOLDS, 0) > LEAST_FIXES
     if share > UNUSED_SHARE or held:
-        why = HOLDS if held else max(left, key=lambda reason: left[reason])
+        why = HOLDS if held else max(left, key=left.__getitem__)
         hint = next((hint for begin, hint in ADVICE.items() if why.startswith(begin)), "")
         first = summary.refused[why][1]
         yield (
@@ -415,8 +415,9 @@ def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
     name, late = row["vehicle"], row["late_s"]
     column, mends = c.world.ids.index(name), f"clock={name}:{late:.3f}"
     used = np.isfinite(off[:, column])
-    noise = c.fix_noise * max(row.get("nis") or 1.0, 1.0) ** 0.5
-    (ahead,), (unsure,) = factors(off[used, column], made[2:, used, column].T, noise)
+    (ahead,), (unsure,) = factors(
+        off[used, column], made[2:, used, column].T, c.fix_noise * max(row["nis"] or 1.0, 1.0) ** 0.5
+    )
     if abs(ahead + late) > SURE_ERRORS * np.hypot(unsure, row["late_s_error"]):
         return ", its fixes are not: is a velocity the mean of the interval before its stamp, which is half of it late?"
     if abs(ahead) > SURE_ERRORS * unsure:
@@ -448,7 +449,7 @@ def _of_fixes(c: Check) -> Iterator[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        wrong = _beyond(row, "nis", OUTLYING) or row.get("per_std", 0.0) > OUTLYING
+        wrong = _beyond(row, "nis", OUTLYING) or _beyond(row, "per_std", OUTLYING)
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             yield (
                 f"{name}: its fixes are {abs(lag):.0f} s {'behind' if lag > 0 else 'ahead of'} the {what}, which "

@@ -449,8 +449,13 @@ def on_time(c: Check, alike: bool, true: Check) -> Check:
     off = np.where(abs(value) > np.maximum(SURE_CLOCK_ERRORS * error, least), value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(np.column_stack([each @ off[which] for each in made]))
-    ranges = tuple(zip(off[size:], error[size:], strict=True))
-    return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], ranges=ranges)
+    return replace(
+        c,
+        relative=relative,
+        ahead=off[:size],
+        unsure=error[:size],
+        ranges=tuple(zip(off[size:], error[size:], strict=True)),
+    )
 
 
 def worst(c: Check, column: int) -> tuple[str, float, Floats]:

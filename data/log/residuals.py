@@ -169,8 +169,12 @@ def filtered(log: Log) -> Check:
     if rec.body is None:
         followed = [column for column in range(vehicles) if rec.stretches(column)]
         if not followed:
-            allowed = "must hold a vehicle that is there at two steps in a row from a fix on"
-            raise InputError("log", log.summary.name, allowed, "Log fixes and odometry of the same time.")
+            raise InputError(
+                "log",
+                log.summary.name,
+                "must hold a vehicle that is there at two steps in a row from a fix on",
+                "Log fixes and odometry of the same time.",
+            )
         track = Kalman(robust=False)(rec, followed)
     else:
         begin, spread, start = begin_of(log)
