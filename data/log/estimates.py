@@ -249,7 +249,7 @@ def odometry(c: Check, column: int) -> Estimate:
             along = driven.conj() / abs(driven)  # across, a heading that is derived follows the fixes
             y, causes, span = (y * along).real + 0j, (causes * along).real + 0j, 0.0 * span
         value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
-        attenuation = (norm(noise) * rec.dt / max(norm(driven), 1e-6)) ** 2  # by noise of the cause
+        attenuation = np.square(norm(noise) * rec.dt / (norm(driven) or 1.0))  # by noise of the cause
         turned = (1 + complex(*value[:2])) * (1 + attenuation)
         if abs(turned.real) < LEAST_FORWARD:
             return none
