@@ -61,8 +61,7 @@ class MrclamLog:
     @property
     def heading(self) -> Floats:
         """(T, N) rad, Vicon, unwrapped, NaN in gaps."""
-        assert self.fleet.heading is not None
-        return self.fleet.heading
+        return self.fleet.heading  # type: ignore[return-value]
 
     __repr__ = short_repr
 

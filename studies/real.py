@@ -47,8 +47,7 @@ def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[A
     source = drives.source(data)
     alone = source.drive(until, near(0))
     steps, settled = (int(s / alone.recording.dt) for s in (until, min(UNTIL_THINNED, until / 10)))
-    assert alone.truth is not None
-    first, truth = alone.recording.between(0, steps), alone.truth.between(0, steps)
+    first, truth = alone.recording.between(0, steps), alone.truth.between(0, steps)  # type: ignore[union-attr]
 
     def fitted(egos: tuple[str, ...], *ends: int) -> Sensors:
         tasks = []

@@ -388,8 +388,7 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
     interval = 0.0 if interval is None else check_interval(interval)
     if noise_model.process_std is not None:
         return MotionNoise(np.array(noise_model.process_std, float), np.zeros(3), 0.0, 0.0, interval)
-    assert noise_model.sensors is not None
-    return noise_model.sensors.motion_noise(interval)
+    return noise_model.sensors.motion_noise(interval)  # type: ignore[union-attr]
 
 
 def check_interval(interval: float) -> float:

@@ -168,7 +168,7 @@ def run_study(
         return results
 
 
-def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params | None = None) -> Path:
+def write_tracks(study: Study | str, out: str | Path, settings: Params) -> Path:
     """Estimate again what the cells of a study estimated, and write a TUM file for each ego and run of each cell.
 
     Args:

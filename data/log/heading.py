@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -188,15 +188,11 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     gnss[0, step[step >= 0], 0] = fixes.value[step >= 0, :2] @ np.eye(2, 3)
     runs = np.arange(len(OTHERWISE) * FIRST_DIRECTIONS)
     rec = replace(rec, gnss=gnss).of_runs(0 * runs)
-    assert rec.body is not None
     meant = np.repeat(OTHERWISE, FIRST_DIRECTIONS)[:, None, None]
-    rec = replace(rec, body=replace(rec.body, yaw_rate=meant * rec.body.yaw_rate))
+    rec = replace(rec, body=replace(rec.body, yaw_rate=meant * rec.body.yaw_rate))  # type: ignore[type-var, union-attr]
     begin = np.pad(gnss[0, 0, 0], (0, 1)) + np.outer(runs % FIRST_DIRECTIONS, [0, 0, 0, 2 * pi / FIRST_DIRECTIONS])
     spread = std, std, PLANE_STD, pi / FIRST_DIRECTIONS
-    track = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
-    assert track.covariance is not None
-    assert track.heading is not None
-    assert track.heading_covariance is not None
+    track: Any = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
     known = 2.0 * std**2 + np.trace(track.covariance[:, :, 0, :2, :2], axis1=2, axis2=3)
     sums = np.nancumsum(np.square(fix_innovations(track, rec)[:, :, 0]).sum(-1) / known, axis=1)
     best = sums[:FIRST_DIRECTIONS].argmin(0), np.arange(len(t))

@@ -124,8 +124,7 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:
         InputError: a vehicle that has neither a fix nor sees a landmark in the first seconds, nor a true pose.
     """
     rec, truth, moving = log.recording, log.truth, log.recording.vehicles
-    assert rec.body is not None
-    if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
+    if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():  # type: ignore[union-attr]
         return None, None, ""
     try:
         return pose_start(rec, gate=GATE_STDS), None, ""
@@ -179,10 +178,9 @@ def filtered(log: Log) -> Check:
     else:
         begin, spread, start = begin_of(log)
         track = PoseFilter("solo", gate=GATE_STDS, begin=begin, spread=spread)(rec, rec.vehicles)
-    columns, squares = list(track.egos), normalised_innovations(track, rec)
-    assert squares is not None
-    assert track.covariance is not None
-    x[:, columns], variance[:, columns] = track.x[0], np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
+    squares: Any = normalised_innovations(track, rec)
+    columns, covariance = list(track.egos), track.covariance[0]  # type: ignore[index]
+    x[:, columns], variance[:, columns] = track.x[0], np.diagonal(covariance, axis1=-2, axis2=-1)
     fix[:, columns], normalised[:, columns] = fix_innovations(track, rec)[0], squares[0]
     for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
         lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]

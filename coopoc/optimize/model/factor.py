@@ -268,8 +268,7 @@ class Factor:
     @cached_property
     def root(self) -> Floats:
         """W as (M, size, size)."""
-        root = self.sqrt_information if self.std is None else np.eye(self.size) / self.std[:, None]
-        assert root is not None
+        root: Any = self.sqrt_information if self.std is None else np.eye(self.size) / self.std[:, None]
         return np.broadcast_to(root, (len(self.nodes), self.size, self.size))
 
     def __repr__(self) -> str:

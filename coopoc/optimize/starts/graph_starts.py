@@ -313,8 +313,8 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     References:
         Kaess et al., iSAM, T-RO 2008: an estimate that follows the measurements in time.
     """
-    assert problem.x0 is not None
-    space, x, n = problem.space, problem.x0.copy(), len(graph.names)
+    x0 = np.asarray(problem.x0)
+    space, x, n = problem.space, x0.copy(), len(graph.names)
     solved, ranges, iterations, whole = np.zeros(n, bool), np.zeros(n, int), 0, 0
     last, count = solved, _stages(graph)
     for stage in range(count):
@@ -324,7 +324,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
             used[new] = True
             old = new[solved[new]]
             if len(old) and len(old) < len(places):
-                x[places[len(old) :]] = carried(space, problem.x0[places[len(old) :]], problem.x0[old[-1]], x[old[-1]])
+                x[places[len(old) :]] = carried(space, x0[places[len(old) :]], x0[old[-1]], x[old[-1]])
         joins = np.zeros(n, bool)
         for edges in (graph.relative_point, graph.point_prior):
             joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
@@ -334,7 +334,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
             if joins[point] and len(others) >= 2 * ranges[point]:
                 x[point, : space.dimension] = trilaterate(x[others, : space.dimension], distance)
                 ranges[point] = len(others)
-        x[list(problem.fixed)] = problem.x0[list(problem.fixed)]
+        x[list(problem.fixed)] = x0[list(problem.fixed)]
         before, solved = solved, used | joins
         free = solved & (~before | last | ~graph.is_pose)
         last = solved & ~before

@@ -249,6 +249,6 @@ def reached_once(costs: Sequence[float], least: float) -> tuple[str, ...]:
     return (f"one of {len(costs)} starts leads to this minimum: a lower one may exist",) * once
 
 
-def higher(cost: float, least: float, share: float = SAME_MINIMUM) -> bool:
-    """Whether a cost is above another by more than that share, and than rounding makes of exact data."""
-    return cost > (1.0 + share) * least + ROUNDED_COST
+def higher(cost: float, least: float) -> bool:
+    """Whether a cost is above another by more than SAME_MINIMUM of it, and than rounding makes of exact data."""
+    return cost > (1.0 + SAME_MINIMUM) * least + ROUNDED_COST
