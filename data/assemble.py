@@ -14,6 +14,8 @@ SAME_INSTANT = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
 MIN_TYPICAL_SPEED, MAX_TYPICAL_SPEED = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
+NOISE_STDS = 6.0
+"""Standard deviations of a position that the fastest moves between two of which a speed is taken."""
 MAX_HEIGHT = 1e5
 """m, beyond which a height is a coordinate from the centre of the earth."""
 REGION = 2.0
@@ -166,15 +168,17 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
     return between | (np.minimum(abs(at - t[left]), abs(at - t[right])) <= edge + SAME_INSTANT)
 
 
-def check_scale(paths: Sequence[tuple[Floats, Floats]], file: str) -> None:
+def check_scale(paths: Sequence[tuple[Floats, Floats]], file: str, std: float = 0.0) -> None:
     """InputError where paths look like degrees or ECEF, or move too fast for metres and seconds.
 
-    The typical speed of a vehicle is the median of |dx| / dt over the pairs of rows between which it moves, that of a
-    file the largest of its vehicles. A file in which nothing moves has none.
+    The typical speed of a vehicle is the median of |dx| / dt over the pairs of rows between which it moves, each so
+    much later that noise hardly counts; that of a file the largest of its vehicles. A file in which nothing moves has
+    none.
 
     Args:
         paths: (L,) s and (L, 2 or more) m of each vehicle in time order.
         file: named in the error.
+        std: m, of positions.
 
     >>> check_scale([(np.array([0.0, 1]), np.array([[11.58, 48.14], [11.5801, 48.1401]]))], "drive.csv")
     Traceback (most recent call last):
@@ -183,7 +187,8 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
     """
     speed, places = 0.0, np.concatenate([position[:, :2] for _, position in paths])
     for t, position in paths:
-        each = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
+        later = np.searchsorted(t, t[:-1] + NOISE_STDS * std / MAX_TYPICAL_SPEED, "right").clip(max=len(t) - 1)
+        each = np.linalg.norm((position[later] - position[:-1])[:, :2], axis=1) / (t[later] - t[:-1])
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, south), (east, north) = places.min(0).tolist(), places.max(0).tolist()
     if (

@@ -323,3 +323,14 @@ def test_a_radars_range_is_not_known_to_its_partner(tmp_path):
     log = read_log(strange(tmp_path, "car", seconds=30.0))
     assert (log.recording.links.observer > log.recording.links.neighbour).all()
     assert "ranges beside a direction count for who measured them alone" in str(log.summary)
+
+
+@pytest.mark.parametrize("std", [3.5, None])
+def test_noisy_fixes_at_a_high_rate_have_no_speed_of_their_own(tmp_path, std):
+    """588 m/s from one to the next; of days the speed is one."""
+    t = np.arange(0, 20, 0.01)
+    x, y = default_rng(0).normal(0, 3.5, (2, len(t)))
+    drive = pd.DataFrame({"t": t, "x": 10 * t + x, "x_std": std, "y": y, "vx": 10.0, "vy": 0.0})
+    assert read_log(write(drive, tmp_path / "a.csv")).summary.read["fixes"] == len(t)
+    with refused(r"a typical speed of [89].*e\+05 m/s"):
+        read_log(write(drive.assign(t=t / 86400), tmp_path / "a.csv"))

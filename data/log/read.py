@@ -43,7 +43,19 @@ from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_fac
 from .links import linked, of_vehicles
 from .motion import VELOCITIES, Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
-from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, not_vague, only, without_codes
+from .units import (
+    KINDS,
+    Rows,
+    Summary,
+    check_values,
+    distinct,
+    fresh,
+    in_group,
+    not_vague,
+    only,
+    stated_std,
+    without_codes,
+)
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
@@ -242,7 +254,7 @@ def read_log(
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
     paths = [samples(group, ("x", "y", "z"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
     if not any_scale and any(len(t) for t, _ in paths):
-        check_scale(paths, path.name)
+        check_scale(paths, path.name, np.nan_to_num(stated_std(rows, "x", "y"), nan=Sensors().gnss_std[0]))
     ids = _ids(rows, body, summary)
     carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
