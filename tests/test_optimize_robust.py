@@ -11,7 +11,7 @@ from oracles.whitened import LOSSES, hessian
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from coopoc.optimize import MEASUREMENTS, Loss, Problem, solve, solve_gnc
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, pose, solve, solve_gnc
 from coopoc.optimize.assess.assess import newton_decrease
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 
@@ -129,3 +129,25 @@ def test_geman_mcclure_ends_where_gtsams_gnc_does():
         stated = replace(problem, factors=(*problem.factors[:3], replace(problem.factors[3], loss=loss)))
         theirs = gtsams_gnc(problem, gtsam.GncLossType.GM)[1]
         assert solve(stated).cost == pytest.approx(graph_of(stated, forms(stated)).error(theirs.optimize()), rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", [18, 22, 29])
+def test_poses_that_a_loss_may_part_end_as_low_as_from_the_truth(seed):
+    """Five poses with fixes, relative poses and ranges, of which a quarter is wrong."""
+    rng, n, loss = np.random.default_rng(seed), 5, Loss("cauchy", 1.0)
+    at, turn = 10 * rng.normal(size=(n, 2)), rng.uniform(-3, 3, n)
+    i, j = np.triu_indices(n, 1)
+
+    def bad(m):
+        return 10 * (rng.random((m, 1)) < 0.25) * rng.normal(size=(m, 2))
+
+    c, s, (x, y) = np.cos(turn[:-1]), np.sin(turn[:-1]), np.diff(at, axis=0).T
+    problem = Problem(range(n), dimension=2, poses=range(n))
+    problem = problem.add("position", range(n), at + rng.normal(size=(n, 2)) + bad(n), std=1.0, loss=loss)
+    gap = np.c_[c * x + s * y, c * y - s * x] + 0.2 * rng.normal(size=(n - 1, 2)) + bad(n - 1)
+    pairs, z = [(k, k + 1) for k in range(n - 1)], pose(gap, np.diff(turn))
+    problem = problem.add("relative_pose", pairs, z, std=[0.2, 0.2, 0.05], loss=loss)
+    far = np.hypot(*(at[j] - at[i]).T) + bad(len(i))[:, 0] + 0.3 * rng.normal(size=len(i))
+    problem = problem.add("range", np.c_[i, j], np.maximum(far, 0.1), std=0.3, loss=loss)
+    least = solve(replace(problem, x0=pose(at, turn)), throw=False).cost
+    assert solve(problem, throw=False).cost <= least * (1 + 1e-6)

@@ -138,8 +138,7 @@ def along_poses(problem: Problem) -> Floats:
 def joining(problem: Problem) -> list[Ints]:
     """Of each factor that holds nodes in one body, their pairs: relative poses, and points that a pose sees."""
     every = [(f, f.nodes[f.informative]) for f in problem.factors if _field(f).startswith("relative")]
-    points = np.setdiff1d(np.arange(len(problem.names)), problem.poses)
-    return [n if f.measurement.compares_poses else n[np.isin(n[:, 1], points)] for f, n in every]
+    return [n if f.measurement.compares_poses else n[np.isin(n[:, 1], problem.poses, invert=True)] for f, n in every]
 
 
 def _field(factor: Factor) -> str:

@@ -161,7 +161,8 @@ def race(
 def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterator[Floats]:
     """Nodes x (n, ambient) with bodies, which relative measurements hold together and no pose is measured of, moved at
     random as far as they are from one another: all (or the `loose`), one, or all across the plane or line that they are
-    nearest to; at first turned alone. A point is a body, and goes anywhere among the others."""
+    nearest to; at first turned alone. A point is a body, and goes anywhere among the others. Of every eight draws the
+    last four take what a robust loss may part for bodies of their own."""
     from scipy.spatial.transform import Rotation
 
     rng, space, n = np.random.default_rng(0), problem.space, len(x)
@@ -169,12 +170,15 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
     center = np.median(at, axis=0)  # what has gone far away draws nothing there
     spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
     normal = np.linalg.svd(at - at.mean(0), full_matrices=False)[2][-1]
-    part = parts(n, *joining(problem))
+    sure = problem.replace_unchecked(factors=tuple(f for f in problem.factors if f.loss is None))
+    bodies = [parts(n, *joining(each)) for each in (problem, sure)]
     poses = [f.nodes[f.informative, 0] for f in problem.factors if f.kind.startswith("pose")]
     held = np.concatenate([np.array(problem.fixed, int), *poses])
-    free = np.setdiff1d(part if loose is None else part[loose], part[held])
-    for k in range(min(DRAWS, DRAWN_POINTS // n) if len(free) else 0):
-        y = x.copy()
+    for k in range(min(DRAWS, DRAWN_POINTS // n)):
+        y, part = x.copy(), bodies[k // 4 % 2]
+        free = np.setdiff1d(part if loose is None else part[loose], part[held])
+        if not len(free):
+            return
         for body in rng.choice(free, 1) if k % 4 == 2 else free:
             own = np.flatnonzero(part == body)
             turn = exp(rng.uniform(-pi, pi, 1)) if d == 2 else Rotation.random(random_state=rng).as_matrix()
