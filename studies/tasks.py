@@ -172,13 +172,11 @@ def observed_task(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
     if task.startswith("robots"):
         until = 300.0
-        drive = pose_drives.source(str(path)).drive(until, near(4))
-        assert drive.truth is not None
+        drive: Any = pose_drives.source(str(path)).drive(until, near(4))
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
     if task == "indoor":
-        log = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
-        assert log.truth is not None
+        log: Any = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
         start = int(0.4 * len(log.recording.t))
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
         begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE_STDS)

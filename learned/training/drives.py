@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypeAlias, cast
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -106,7 +106,7 @@ def drives_of(data: Drives | Logged) -> Drives:
     if isinstance(data, Fleet | MeasuredDrives):
         return data
     if hasattr(data, "recording") and hasattr(data, "truth"):
-        return MeasuredDrives(data.recording, cast(Fleet, data.truth))
+        return MeasuredDrives(data.recording, data.truth)  # type: ignore[arg-type]
     hint = "Take coopoc.load_fleet(...), or coopoc.read_log(...) of a log with a truth."
     raise InputError("data", shown(data), "must be a Fleet, or a log with its truth", hint)
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from .waiting import clock, spent, waiting
 
@@ -57,7 +57,7 @@ def inside(function: Function) -> Function:
 
 def storage(function: Function) -> Function:
     """A function that allocates arrays or returns views of them, typed as if its lines stood in its caller."""
-    return cast(Function, _made(function, set(), inline="always"))
+    return _made(function, set(), inline="always")  # type: ignore[no-any-return]
 
 
 QUIET_SECONDS = 2.0
@@ -125,13 +125,13 @@ def _within(function: Function, liberties: set[str], **options: bool) -> Functio
     made = _made(function, liberties, True, **options)
     if hooks := _hooks():
         hooks[0].for_any_number(made)
-    return cast(Function, made)
+    return made  # type: ignore[no-any-return]
 
 
 def _kept(function: Function, liberties: set[str]) -> Function:
     made = _made(function, liberties)
     if not getattr(sys.modules.get(function.__module__), "__file__", None):  # typed in: there is no source to go by
-        return cast(Function, made)
+        return made  # type: ignore[no-any-return]
     if hooks := _hooks():
         made._cache = hooks[1].MachineCode(function)
     else:
@@ -139,4 +139,4 @@ def _kept(function: Function, liberties: set[str]) -> Function:
             RuntimeError
         ):  # neither the source's folder nor the user's can be written: every process compiles
             made.enable_caching()
-    return cast(Function, made)
+    return made  # type: ignore[no-any-return]

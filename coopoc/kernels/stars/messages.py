@@ -6,7 +6,7 @@ whose position was used before, or has no fix, has new = 0.
 """
 
 import math
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -38,7 +38,7 @@ Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 UNIT = np.ones(3)
 """Standard deviations m where covariances are unit matrices."""
 ROW, BLOCK, RELATIVE = (0.0,) * 3, (0.0,) * 9, (0.0,) * 8
-NONE = cast(int, np.int64(0))
+NONE: Any = np.int64(0)
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
 
 
