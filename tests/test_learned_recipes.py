@@ -188,7 +188,7 @@ def test_cards_say_what_was_trained_and_how_well(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fedokf"])
+@pytest.mark.parametrize("name", ["fedokf", "fedkalmannet", "centralised"])
 def test_shipped_weights_are_made_again_from_their_recipe(name):
     """To 1e-5 with the versions and the kind of machine that the card names, a few last bits of float32 after thousands
     of steps on another processor of that kind; elsewhere training ends within a few percent."""
