@@ -41,7 +41,7 @@ def two_robots(seed, d=2, fixed=False, prior=False):
     w = World(rng, rng.uniform(-5, 5, (8, d)), exp(rng.uniform(-3, 3, (8, 2 * d - 3))), robots=2, steps=4)
     odometry, ranges = w.relative(w.chain(), 0.05, 0.02), w.ranged(w.near(16, 30.0, others=True), 0.1)
     whole = from_graph(w.graph(relative_pose=odometry, ranges=ranges), "chordal", "file")
-    problem = replace(whole, fixed=(0,) if fixed else ())
+    problem = replace(whole, poses=whole.poses[::-1], fixed=(0,) if fixed else ())
     return problem.add("pose_chordal", 0, problem.x0[0], 0.05) if prior else problem
 
 
@@ -130,7 +130,7 @@ def test_the_bound_is_that_of_the_programme_written_out(d, up):
     """Matrix form (d + m rows) and stacked form have the value of [1; t; s][1; t; s]^T, solved by CVXPY."""
     for seed in range(3):
         problem = swarm(seed, d=d, vehicles=3, stretch=up)
-        assert quadratic(problem).stacked == (up != 1.0)
+        assert quadratic(problem).columns == (d if up == 1.0 else 1)
         assert shor(problem).lower_bound == pytest.approx(by_hand(problem), rel=2e-5, abs=1e-6)
 
 

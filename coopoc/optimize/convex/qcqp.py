@@ -22,7 +22,7 @@ from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..backend import Capabilities
 from ..model.factor import Factor, stacked
-from ..model.problem import Problem
+from ..model.problem import Problem, row_matrix
 from ..model.space import nearest_rotation
 
 
@@ -33,9 +33,9 @@ class Quadratic:
     Args:
         rows: sparse A (M, N). The first `bound` rows of X are constrained, the others free positions.
         stiefel: (n, k) rows of X.
-        sphere: (m, q) rows of X, q = d if the columns are stacked, else 1.
+        sphere: (m, d / columns) rows of X.
         dimension: d.
-        stacked: one column instead of d.
+        columns: of X, d or, stacked, 1.
         framed: the first Stiefel block is H.
         nodes: whose position, and whose rotation, X holds; the others stay as they are in `position` (n, d) m and
             `rotation` (n, d, d).
@@ -48,7 +48,7 @@ class Quadratic:
     stiefel: Ints
     sphere: Ints
     dimension: int
-    stacked: bool
+    columns: int
     framed: bool
     nodes: Ints
     poses: Ints
@@ -56,11 +56,6 @@ class Quadratic:
     rotation: Floats
     edges: Ints
     origin: Floats
-
-    @property
-    def columns(self) -> int:
-        """Of X."""
-        return 1 if self.stacked else self.dimension
 
     @property
     def bound(self) -> int:
@@ -178,7 +173,7 @@ def quadratic(problem: Problem) -> Quadratic:
     fixes = [f.z[:, :d] for f in world if f.kind != "displacement"]
     origin = np.concatenate(fixes).mean(0) if fixes else np.zeros(d)
     edges = stacked((f.nodes for f in problem.factors if f.kind == "range"), 2)
-    rows = _Rows(problem, bool(uneven), bool(world or problem.fixed), len(edges), origin)
+    rows = _Rows(problem, 1 if uneven else d, bool(world or problem.fixed), len(edges), origin)
     for factor in problem.factors:
         TERMS[factor.kind](rows, factor)
     x = np.zeros((n, problem.space.ambient)) if problem.x0 is None else problem.x0
@@ -190,10 +185,10 @@ def quadratic(problem: Problem) -> Quadratic:
     top = len(rows.frame) + d * len(poses)
     return Quadratic(
         rows=A,
-        stiefel=np.arange(top).reshape(-1, len(rows.frame) if uneven else d),
+        stiefel=np.arange(top).reshape(-1, rows.columns),
         sphere=top + np.arange(len(edges) * rows.width).reshape(len(edges), rows.width),
         dimension=d,
-        stacked=bool(uneven),
+        columns=rows.columns,
         framed=rows.framed,
         nodes=np.setdiff1d(np.arange(n), problem.fixed),
         poses=poses,
@@ -208,11 +203,11 @@ class _Rows:
     """The rows of A, and where X has the rotation and the position of each node: `width` rows of X per unit vector and
     per position."""
 
-    def __init__(self, problem: Problem, stacked: bool, framed: bool, ranges: int, origin: Floats) -> None:
+    def __init__(self, problem: Problem, columns: int, framed: bool, ranges: int, origin: Floats) -> None:
         self.d, self.n, self.origin, self.framed = problem.dimension, len(problem.names), origin, framed
-        self.poses, self.fixed = (np.array(each, int) for each in (problem.poses, problem.fixed))
-        self.stacked, self.width = stacked, self.d if stacked else 1
-        self.frame = np.arange((1 if stacked else self.d) * framed)
+        self.poses, self.fixed = (np.unique(np.array(each, int)) for each in (problem.poses, problem.fixed))
+        self.columns, self.width = columns, self.d // columns
+        self.frame = np.arange(columns * framed)
         self.first_unit = len(self.frame) + self.d * len(self.poses)
         self.first_position = self.first_unit + self.width * ranges
         self.used = 0
@@ -220,9 +215,7 @@ class _Rows:
 
     def rotation(self, node: Ints) -> Ints:
         """(M, d) rows of X with the R^T of poses."""
-        order = np.full(self.n, -1, int)
-        order[self.poses] = np.arange(len(self.poses))
-        return len(self.frame) + self.d * order[node][:, None] + np.arange(self.d)
+        return len(self.frame) + self.d * np.searchsorted(self.poses, node)[:, None] + np.arange(self.d)
 
     def position(self, node: Ints) -> Ints:
         """(M, width) rows of X with the positions of nodes."""
@@ -238,31 +231,17 @@ class _Rows:
         """k rows of A per measurement: values (M, k, c) in columns (M, c)."""
         self.parts.append((np.concatenate(values, axis=2), np.concatenate(columns, axis=1)))
 
-    def matrix(self) -> Any:
-        """A over all nodes."""
-        from scipy.sparse import csr_array, vstack
-
-        size, blocks = self.first_position + self.width * self.n, []
-        for value, columns in self.parts:
-            count, k, c = value.shape
-            at = np.broadcast_to(columns[:, None], value.shape).ravel()
-            blocks.append(csr_array((value.ravel(), at, np.arange(0, count * k * c + 1, c)), shape=(count * k, size)))
-        A = vstack(blocks, format="csr")
-        A.sum_duplicates()
-        return A
-
     def without_fixed(self, position: Floats, rotation: Floats) -> Any:
         """A without fixed nodes, whose terms move to the frame: t_i = p_i^T H and R_i^T = R_i^T H."""
         from scipy.sparse import csr_array, hstack
 
-        A, fixed, size = self.matrix(), self.fixed, len(self.frame)
+        A, fixed, size = row_matrix(self.parts, self.first_position + self.width * self.n), self.fixed, len(self.frame)
+        A.sum_duplicates()
         if not len(fixed):
             return A
-        at, turned = self.position(fixed), np.intersect1d(fixed, self.poses)
-        gone = np.concatenate([at.ravel(), self.rotation(turned).ravel()])
-        values = [position[fixed].reshape(at.size, -1)]
-        if len(turned):
-            values.append(rotation[turned].mT.reshape(-1, self.d))
+        turned = np.intersect1d(fixed, self.poses)
+        gone = np.concatenate([self.position(fixed).ravel(), self.rotation(turned).ravel()])
+        values = [part.reshape(-1, self.columns) for part in (position[fixed], rotation[turned].mT)]
         frame = A[:, :size] + A[:, gone] @ csr_array(np.concatenate(values))
         return hstack([frame, A[:, np.setdiff1d(np.arange(size, A.shape[1]), gone)]], format="csr")
 
@@ -270,11 +249,10 @@ class _Rows:
 def _position(rows: _Rows, factor: Factor) -> None:
     """W (t_i - z), or of a displacement W (t_j - t_i - z), z in the world's frame."""
     z = factor.z if factor.kind == "displacement" else factor.z - rows.origin
-    root = factor.root if rows.stacked else factor.root[:, :1, :1]
-    measured = z[:, :, None] if rows.stacked else z[:, None, :]
+    root = factor.root[:, : rows.width, : rows.width]
     ends = [-root, root][2 - factor.nodes.shape[1] :]
-    frame = np.tile(rows.frame, (len(z), 1))
-    rows.add([*ends, -root @ measured], [*(rows.position(node) for node in factor.nodes.T), frame])
+    values = [*ends, -root @ z.reshape(-1, rows.width, rows.columns)]
+    rows.add(values, [*(rows.position(node) for node in factor.nodes.T), np.tile(rows.frame, (len(z), 1))])
 
 
 def _range(rows: _Rows, factor: Factor) -> None:

@@ -43,7 +43,7 @@ class Reduced:
         from scipy.sparse import csc_array
         from scipy.sparse.csgraph import connected_components
 
-        bound, width = self.problem.bound, self.problem.dimension if self.problem.stacked else 1
+        bound, width = self.problem.bound, self.problem.sphere.shape[1]
         free = self.problem.rows[:, bound:].tocsc()
         part = connected_components(free.T @ free, directed=False)[1]
         _, first, label = np.unique(part * width + np.arange(len(part)) % width, return_index=True, return_inverse=True)

@@ -350,18 +350,23 @@ def no_such_node(
 
 def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:
     """`Problem.linearise` at x (n, ambient), which need not be checked, and the sparse Jacobian (rows, n dof), CSR."""
+    linear, (n, dof) = linearise(problem.space, problem.factors, problem.movable, x), problem.movable.shape
+    columns = [(dof * f.nodes[:, :, None] + np.arange(dof)).reshape(len(f.nodes), -1) for f in problem.factors]
+    values = [np.concatenate(jacobians, axis=2) for jacobians in linear.jacobian]
+    return linear, row_matrix(zip(values, columns, strict=True), n * dof)
+
+
+def row_matrix(blocks: Iterable[tuple[Floats, Ints]], width: int) -> Any:
+    """Sparse matrix (rows, width), CSR, of blocks: k rows for each measurement, values (M, k, c) in columns (M, c)."""
     from scipy.sparse import csr_array
 
-    linear = linearise(problem.space, problem.factors, problem.movable, x)
-    (n, dof), data, columns, lengths = problem.movable.shape, [], [], []
-    for factor, jacobians in zip(problem.factors, linear.jacobian, strict=True):
-        by_nodes = np.concatenate(jacobians, axis=2)
-        own = (dof * factor.nodes[:, :, None] + np.arange(dof)).reshape(len(by_nodes), 1, -1)
-        data.append(by_nodes.ravel())
-        columns.append(np.broadcast_to(own, by_nodes.shape).ravel())
-        lengths.append(np.full(by_nodes[..., 0].size, own.shape[2]))
+    data, columns, lengths = [], [], []
+    for values, own in blocks:
+        data.append(values.ravel())
+        columns.append(np.broadcast_to(own[:, None], values.shape).ravel())
+        lengths.append(np.full(values[..., 0].size, own.shape[1]))
     starts = np.append(0, np.cumsum(stacked(lengths)))
-    return linear, csr_array((stacked(data), stacked(columns), starts), shape=(len(starts) - 1, n * dof))
+    return csr_array((stacked(data), stacked(columns), starts), shape=(len(starts) - 1, width))
 
 
 def rows_among(problem: Problem, used: Bools) -> list[Ints]:
