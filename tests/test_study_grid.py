@@ -109,15 +109,14 @@ def test_assignments():
 PACKAGE = {
     "__init__": "",
     "cells": '''"""Cells."""
-from . import numbers
+import reached_package.numbers
 from .views import table, SHARED
-import numpy as np
 
 def cell(p):
     """One row."""
-    return [{"y": numbers.double(p["x"]) + SHARED}]
+    return [{"y": getattr(reached_package.numbers, "double")(p["x"]) + SHARED}]
 ''',
-    "numbers": "def double(x):\n    return FACTOR * x\n\nFACTOR = 2\nUNUSED = 1\n",
+    "numbers": "def double(x):\n    return FACTOR.real * x\n\nFACTOR = complex(1, 2)\nUNUSED = 1\n",
     "views": "SHARED = 3\nCAPTION = 'old'\n\ndef table(results):\n    return CAPTION\n",
 }
 
@@ -137,13 +136,11 @@ def package(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "old", "new", "same"),
     [
-        ("numbers", "FACTOR * x", "FACTOR * x + 1", False),
-        ("numbers", "FACTOR = 2", "FACTOR = 3", False),
+        ("numbers", "FACTOR.real * x", "FACTOR.real * x + 1", False),
+        ("numbers", "(1, 2)", "(2, 1)", False),
         ("views", "SHARED = 3", "SHARED = 4", False),
         ("cells", "+ SHARED", "- SHARED", False),
-        ("cells", "import numpy as np", "import numpy as np\nimport math", True),
-        ("cells", "One row.", "A row.", True),
-        ("numbers", "FACTOR * x", "FACTOR * x  # doubled", True),
+        ("numbers", "FACTOR.real * x", "FACTOR.real * x  # doubled", True),
         ("numbers", "UNUSED = 1", "UNUSED = 2", True),
         ("views", "'old'", "'new'", True),
         ("views", "return CAPTION", "return CAPTION * 2", True),
@@ -159,15 +156,14 @@ def test_only_what_a_cell_reaches_is_in_its_name(package, name, old, new, same):
     importlib.invalidate_caches()
     cell = importlib.import_module("reached_package.cells").cell
     assert (code_of(cell) == before) is same
-    assert (code_of(partial(cell)) == before) is same
 
 
 def test_a_cell_without_a_file_counts_by_what_it_names(monkeypatch):
     """As in a shell."""
-    monkeypatch.setitem(sys.modules, "shell", shell := ModuleType("shell"))
+    monkeypatch.setitem(sys.modules, "__main__", shell := ModuleType("__main__"))
     codes = []
     for number in (3, 5, 3):
-        exec(f"k = {number}\nclass Own:\n    f = lambda p: k\ncell = lambda p: [Own for _ in p]", vars(shell))
+        exec(f"k = {number}\ncell = lambda p: [k for _ in p]", vars(shell))
         codes.append(code_of(shell.cell))
     assert codes[0] == codes[2] != codes[1]
 

@@ -4,22 +4,18 @@ import ast
 import functools
 import hashlib
 import importlib.util
-import inspect
 import os
+import pickletools
 import platform
 import re
 import subprocess
 import sys
-import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
 from typing import Any
-
-import numpy as np
 
 from ..errors import InputError
 
@@ -83,95 +79,77 @@ def revision(*modules: str) -> str:
 
 
 def code_of(function: Callable[..., Any]) -> str:
-    """Hash of a function's source and of all that it names in its own package, functions, classes and constants.
+    """Hash of the text of a function's file and of the files that it imports: of what is installed, those of the
+    function's own package only.
 
-    Comments, docstrings and layout do not count, nor does what nothing in the cell names: tables, figures, captions.
-    Other packages count by the names that are used, not by their contents.
+    Comments and layout do not count, nor functions and values whose names stand in nothing that counts: tables,
+    figures, captions. Of a function that no file names, as a partial or one of a shell, its pickle counts, too.
 
     >>> len(code_of(code_of))
     20
-    >>> code_of(textwrap.dedent) == code_of(textwrap.fill)  # of Python itself nothing counts
-    True
-    >>> code_of(eval("lambda: 2")) == code_of(eval("lambda: 3"))  # no file, as in a shell
+    >>> code_of(eval("lambda: 2")) == code_of(eval("lambda: 3"))
     False
     """
-    texts: set[str] = set()
-    _reach(function, texts, [])
-    return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:20]
+    inner = function.func if isinstance(function, functools.partial) else function
+    home, name = getattr(inner, "__module__", None) or "", getattr(function, "__qualname__", "")
+    module, contents = sys.modules.get(home), [("", name)]
+    if not hasattr(module, "__file__") or getattr(module, name, None) is not function:
+        from joblib.externals.loky.backend.reduction import dumps  # 30 ms, and workers get it so
+
+        contents = [(code.name, part) for code, part, _ in pickletools.genops(bytes(dumps(function)))]
+    words = {home, "", "__getattr__", *(part for _, part in contents if isinstance(part, str))}
+    package = getattr(module, "__package__", "") or home
+    if not package.startswith("coopoc."):
+        package = package.partition(".")[0]
+    modules, before = words & sys.modules.keys(), 0
+    statements = cache(lambda name: _statements(name, package, words, modules))
+    while before < (before := len(words) + len(modules)):
+        kept = [each for name in sorted(modules) for each in statements(name) if _counts(each, words)]
+    return hashlib.sha256(f"{contents}{ast.unparse(ast.Module(kept, []))}".encode()).hexdigest()[:20]
 
 
-def _reach(thing: Any, texts: set[str], visited: list[Any]) -> None:
-    """Add the text of a value and of what it names: source of functions and classes, contents of constants."""
-    if isinstance(thing, functools.partial):
-        thing = [thing.func, thing.args, thing.keywords]
-    if callable(thing):
-        thing = inspect.unwrap(thing)
-    if isinstance(thing, str | int | float | bool | None | bytes):
-        texts.add(repr(thing))
-    elif not any(thing is other for other in visited):
-        visited.append(thing)
-        if isinstance(thing, Mapping):
-            thing = list(thing.items())
-        if isinstance(thing, list | tuple | set | frozenset):
-            for each in thing:
-                _reach(each, texts, visited)
-        elif isinstance(thing, np.ndarray):
-            texts.add(repr(thing.tolist()))
-        elif isinstance(thing, FunctionType | type):
-            for each in _named(thing, texts):
-                _reach(each, texts, visited)
-        elif not isinstance(thing, ModuleType):
-            _reach([type(thing), {} if callable(thing) else getattr(thing, "__dict__", {})], texts, visited)
+def _statements(name: str, package: str, words: set[str], modules: set[str]) -> list[ast.stmt]:
+    """Statements of a module; its strings and what it imports join the words and modules. None of one that is installed
+    beside the package."""
+    base = name.partition(".")[0]
+    with suppress(ImportError, ValueError, OSError, SyntaxError, TypeError):  # no module, or no text
+        if not f"{name}.".startswith(f"{package}.") and (
+            base in {*sys.stdlib_module_names, "coopoc"}
+            or re.search(r"[/\\](site|dist)-packages\b", str(importlib.util.find_spec(base)))
+        ):
+            return []
+        found = sys.modules.get(name) or importlib.util.find_spec(name)
+        file = Path(getattr(found, "__file__", getattr(found, "origin", "")))
+        tree, above = ast.parse(file.read_bytes()), name.rpartition(".")[0]
+        modules.add(above)
+        for node in ast.walk(tree):
+            match node:
+                case ast.Constant(str(word)):
+                    words.add(word)
+                case ast.Import(names) | ast.ImportFrom(names=names):
+                    relative = "." * getattr(node, "level", 0) + (getattr(node, "module", "") or "")
+                    home = importlib.util.resolve_name(relative, name if file.stem == "__init__" else above)
+                    modules |= {home, *(f"{home}.{alias.name}".strip(".") for alias in names)}
+        return tree.body
+    return []
 
 
-def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:
-    """What a function or a class names in its package, after its own source was added; nothing without source."""
-    module = sys.modules.get(thing.__module__)
-    package = getattr(module, "__package__", "") or thing.__module__
-    if module is None or package.partition(".")[0] in sys.stdlib_module_names:
-        return
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
-    except (OSError, TypeError, SyntaxError):  # no file, as in a shell, or a lambda within an expression
-        if isinstance(thing, type):
-            yield from vars(thing).values()
-            return
-        tree = ast.Module([], [])
-        for code in _codes(thing.__code__):
-            constants = [each for each in code.co_consts if not isinstance(each, CodeType)]
-            texts.add(f"{thing.__qualname__} {code.co_code!r} {code.co_names} {constants}")
-            tree.body += [ast.Expr(ast.Name(name)) for name in (*code.co_names, *code.co_freevars)]
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node):
-            node.body = node.body[1:] or [ast.Pass()]
-    texts.add(ast.unparse(tree))
-    names = dict(vars(module))
-    if isinstance(thing, FunctionType):
-        names |= inspect.getclosurevars(thing).nonlocals
-
-    def within(name: str) -> bool:
-        return f"{name}.".startswith(f"{package}.")
-
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom):
-            home = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            if within(home):
-                source = importlib.import_module(home)
-                names |= {alias.asname or alias.name: getattr(source, alias.name, None) for alias in node.names}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            owner = names.get(node.value.id)
-            if isinstance(owner, ModuleType) and within(owner.__name__):
-                yield getattr(owner, node.attr, None)
-        elif isinstance(node, ast.Name) and node.id in names:
-            value = names[node.id]
-            home = getattr(value, "__module__", None) or package
-            yield value if within(home) else f"{home}.{getattr(value, '__qualname__', '')}"
-
-
-def _codes(code: CodeType) -> list[CodeType]:
-    """Byte code of a function, and of the functions within it."""
-    return [code, *(inner for each in code.co_consts if isinstance(each, CodeType) for inner in _codes(each))]
+def _counts(statement: ast.stmt, words: set[str]) -> bool:
+    """Whether one of the words names what a statement binds, or it may do more; then its own words join them."""
+    match statement:
+        case ast.FunctionDef(name, decorator_list=[]):
+            bound = {name}
+        case ast.Assign(targets):
+            bound = {getattr(target, "id", "") for target in targets}
+        case _:
+            bound = {""}
+    if not bound & words:
+        return False
+    for node in ast.walk(statement):
+        match node:
+            case ast.Name(word) | ast.Attribute(attr=word) | ast.alias(word, str()):
+                words.add(word)
+    return True
 
 
 def _processor() -> str:

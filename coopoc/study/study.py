@@ -113,7 +113,7 @@ class Study:
 
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
-        code = cache(lambda: code_of(self.cell))  # half a second, which a mistake need not wait for
+        code = cache(lambda: self.cell.code if isinstance(self.cell, _FileCell) else code_of(self.cell))
         cells = [_named(self, params, code) for params in points(self)]
         if not cells:
             raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
@@ -181,12 +181,8 @@ def find_study(name: str) -> Study:
         return installed
     study = instance(f"study {name!r}", from_file(name, "study"), Study, "Give STUDY = coopoc.Study(...) in the file.")
     path, _, attribute = name.rpartition(":")
-    code, own = code_of(study.cell), study.key
-
-    def key(params: Params) -> Params:
-        return {**own(params), "cell": code}
-
-    return replace(study, cell=_FileCell(f"{Path(path).resolve()}:{attribute}", file_digest(name, "study")), key=key)
+    place = f"{Path(path).resolve()}:{attribute}"
+    return replace(study, cell=_FileCell(place, file_digest(name, "study"), code_of(study.cell)))
 
 
 @dataclass(frozen=True)
@@ -195,6 +191,7 @@ class _FileCell:
 
     name: str
     contents: str
+    code: str
 
     def __call__(self, params: Params) -> list[Row]:
         if file_digest(self.name, "study") != self.contents:
