@@ -11,9 +11,10 @@ changes nothing; H = I picks the world's. A scalar weight w acts on all d column
 displacement weighs its axes differently the columns are stacked into one, X = [1; vec s; vec t], of d times the rows.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.linalg import det, norm, svd
@@ -159,6 +160,8 @@ def quadratic(problem: Problem) -> Quadratic:
     >>> quadratic(problem.add("range", ("a", "b"), 5.0, std=0.5)).rows.shape
     (3, 6)
     """
+    from scipy.sparse import csr_array, hstack
+
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if lacking := QUADRATIC.lacking(problem):
@@ -172,25 +175,38 @@ def quadratic(problem: Problem) -> Quadratic:
         _refuse(uneven[0])
     fixes = [f.z[:, :d] for f in world if f.kind != "displacement"]
     origin = np.concatenate(fixes).mean(0) if fixes else np.zeros(d)
-    edges = stacked((f.nodes for f in problem.factors if f.kind == "range"), 2)
-    rows = _Rows(problem, 1 if uneven else d, bool(world or problem.fixed), len(edges), origin)
-    for factor in problem.factors:
-        TERMS[factor.kind](rows, factor)
+    ranges = [f.nodes for f in problem.factors if f.kind == "range"]
+    columns, framed = 1 if uneven else d, bool(world or problem.fixed)
+    poses, fixed = (np.unique(np.array(nodes, int)) for nodes in (problem.poses, problem.fixed))
+    q, edges = d // columns, stacked(ranges, 2)
+    sizes = columns * framed, d * len(poses), q * len(edges), q * n
+    frame, turns, units, at = np.split(np.arange(sum(sizes)), np.cumsum(sizes[:3]))
+    each = iter(np.split(units.reshape(-1, q), np.cumsum([*map(len, ranges)])))
+    rows = _Rows(columns, origin, frame, np.zeros((n, d), int), each, at.reshape(n, q))
+    rows.rotation[poses] = turns.reshape(-1, d)
+    blocks = [block for factor in problem.factors for block in TERMS[factor.kind](rows, factor)]
+    A = row_matrix(((np.concatenate(v, axis=2), np.concatenate(c, axis=1)) for v, c in blocks), sum(sizes))
+    A.sum_duplicates()
     x = np.zeros((n, problem.space.ambient)) if problem.x0 is None else problem.x0
     position, rotation = problem.space.position(x), np.array(problem.space.rotation(x))
-    if not problem.fixed:
+    if len(fixed):  # whose terms move to the frame: t_i = p_i^T H and R_i^T = R_i^T H
+        turned = np.intersect1d(fixed, poses)
+        gone = np.concatenate([rows.position[fixed].ravel(), rows.rotation[turned].ravel()])
+        values = [part.reshape(-1, columns) for part in ((position - origin)[fixed], rotation[turned].mT)]
+        moved = A[:, frame] + A[:, gone] @ csr_array(np.concatenate(values))
+        A = hstack([moved, A[:, np.setdiff1d(np.arange(len(frame), A.shape[1]), gone)]], format="csr")
+    else:
         rotation[:] = np.eye(d)
-    A = rows.without_fixed(position - origin, rotation)
-    poses = np.setdiff1d(rows.poses, problem.fixed)
-    top = len(rows.frame) + d * len(poses)
+    poses = np.setdiff1d(poses, fixed)
+    top = len(frame) + d * len(poses)
     return Quadratic(
         rows=A,
-        stiefel=np.arange(top).reshape(-1, rows.columns),
-        sphere=top + np.arange(len(edges) * rows.width).reshape(len(edges), rows.width),
+        stiefel=np.arange(top).reshape(-1, columns),
+        sphere=top + np.arange(units.size).reshape(-1, q),
         dimension=d,
-        columns=rows.columns,
-        framed=rows.framed,
-        nodes=np.setdiff1d(np.arange(n), problem.fixed),
+        columns=columns,
+        framed=framed,
+        nodes=np.setdiff1d(np.arange(n), fixed),
         poses=poses,
         position=position,
         rotation=rotation,
@@ -199,84 +215,55 @@ def quadratic(problem: Problem) -> Quadratic:
     )
 
 
-class _Rows:
-    """The rows of A, and where X has the rotation and the position of each node: `width` rows of X per unit vector and
-    per position."""
+class _Rows(NamedTuple):
+    """Which rows of X are the `frame`, R^T of each pose, `rotation` (n, d), the unit vectors (M, q) of one factor of
+    ranges after the other, and each `position` (n, q)."""
 
-    def __init__(self, problem: Problem, columns: int, framed: bool, ranges: int, origin: Floats) -> None:
-        self.d, self.n, self.origin, self.framed = problem.dimension, len(problem.names), origin, framed
-        self.poses, self.fixed = (np.unique(np.array(each, int)) for each in (problem.poses, problem.fixed))
-        self.columns, self.width = columns, self.d // columns
-        self.frame = np.arange(columns * framed)
-        self.first_unit = len(self.frame) + self.d * len(self.poses)
-        self.first_position = self.first_unit + self.width * ranges
-        self.used = 0
-        self.parts: list[tuple[Floats, Ints]] = []
-
-    def rotation(self, node: Ints) -> Ints:
-        """(M, d) rows of X with the R^T of poses."""
-        return len(self.frame) + self.d * np.searchsorted(self.poses, node)[:, None] + np.arange(self.d)
-
-    def position(self, node: Ints) -> Ints:
-        """(M, width) rows of X with the positions of nodes."""
-        return self.first_position + self.width * node[:, None] + np.arange(self.width)
-
-    def units(self, count: int) -> Ints:
-        """(M, width) rows of X with the next unit vectors."""
-        first = self.first_unit + self.width * self.used
-        self.used += count
-        return first + np.arange(count * self.width).reshape(count, self.width)
-
-    def add(self, values: list[Floats], columns: list[Ints]) -> None:
-        """k rows of A per measurement: values (M, k, c) in columns (M, c)."""
-        self.parts.append((np.concatenate(values, axis=2), np.concatenate(columns, axis=1)))
-
-    def without_fixed(self, position: Floats, rotation: Floats) -> Any:
-        """A without fixed nodes, whose terms move to the frame: t_i = p_i^T H and R_i^T = R_i^T H."""
-        from scipy.sparse import csr_array, hstack
-
-        A, fixed, size = row_matrix(self.parts, self.first_position + self.width * self.n), self.fixed, len(self.frame)
-        A.sum_duplicates()
-        if not len(fixed):
-            return A
-        turned = np.intersect1d(fixed, self.poses)
-        gone = np.concatenate([self.position(fixed).ravel(), self.rotation(turned).ravel()])
-        values = [part.reshape(-1, self.columns) for part in (position[fixed], rotation[turned].mT)]
-        frame = A[:, :size] + A[:, gone] @ csr_array(np.concatenate(values))
-        return hstack([frame, A[:, np.setdiff1d(np.arange(size, A.shape[1]), gone)]], format="csr")
+    columns: int
+    origin: Floats
+    frame: Ints
+    rotation: Ints
+    units: Iterator[Ints]
+    position: Ints
 
 
-def _position(rows: _Rows, factor: Factor) -> None:
+Blocks = list[tuple[list[Floats], list[Ints]]]
+"""k rows of A per measurement: values (M, k, c) in columns (M, c), side by side."""
+
+
+def _position(rows: _Rows, factor: Factor) -> Blocks:
     """W (t_i - z), or of a displacement W (t_j - t_i - z), z in the world's frame."""
-    z = factor.z if factor.kind == "displacement" else factor.z - rows.origin
-    root = factor.root[:, : rows.width, : rows.width]
+    z, q = factor.z if factor.kind == "displacement" else factor.z - rows.origin, rows.position.shape[1]
+    root = factor.root[:, :q, :q]
     ends = [-root, root][2 - factor.nodes.shape[1] :]
-    values = [*ends, -root @ z.reshape(-1, rows.width, rows.columns)]
-    rows.add(values, [*(rows.position(node) for node in factor.nodes.T), np.tile(rows.frame, (len(z), 1))])
+    values = [*ends, -root @ z.reshape(-1, q, rows.columns)]
+    return [(values, [*rows.position[factor.nodes.T], np.tile(rows.frame, (len(z), 1))])]
 
 
-def _range(rows: _Rows, factor: Factor) -> None:
+def _range(rows: _Rows, factor: Factor) -> Blocks:
     """w (t_j - t_i + r s)."""
-    root = factor.root * np.eye(rows.width)
-    columns = [*(rows.position(node) for node in factor.nodes.T), rows.units(len(factor.nodes))]
-    rows.add([-root, root, factor.z[..., None] * root], columns)
+    root = factor.root * np.eye(rows.position.shape[1])
+    return [([-root, root, factor.z[..., None] * root], [*rows.position[factor.nodes.T], next(rows.units)])]
 
 
-def _pose(rows: _Rows, factor: Factor) -> None:
+def _pose(rows: _Rows, factor: Factor) -> Blocks:
     """w (t_i - z), and w (R_i^T - R_z^T H)."""
-    (i,), d = factor.nodes.T, rows.d
-    (w, angular, turn), frame = _weighed(factor, d), np.tile(rows.frame, (len(i), 1))
-    rows.add([w, -w * (factor.z[:, None, :d] - rows.origin)], [rows.position(i), frame])
-    rows.add([angular * np.eye(d), -angular * turn], [rows.rotation(i), frame])
-
-
-def _relative(rows: _Rows, factor: Factor) -> None:
-    """w (t_j - t_i - z R_i^T), as rows, and of a relative pose w (R_j^T - R_ij^T R_i^T)."""
-    (i, j), d = factor.nodes.T, rows.d
+    (i,), d, frame = factor.nodes.T, len(rows.origin), np.tile(rows.frame, (len(factor.z), 1))
     w, angular, turn = _weighed(factor, d)
-    rows.add([-w, w, -w * factor.z[:, None, :d]], [rows.position(i), rows.position(j), rows.rotation(i)])
-    if factor.z.shape[1] > d:
-        rows.add([-angular * turn, angular * np.eye(d)], [rows.rotation(i), rows.rotation(j)])
+    return [
+        ([w, -w * (factor.z[:, None, :d] - rows.origin)], [rows.position[i], frame]),
+        ([angular * np.eye(d), -angular * turn], [rows.rotation[i], frame]),
+    ]
+
+
+def _relative(rows: _Rows, factor: Factor) -> Blocks:
+    """w (t_j - t_i - z R_i^T), as rows, and of a relative pose w (R_j^T - R_ij^T R_i^T)."""
+    (i, j), d = factor.nodes.T, len(rows.origin)
+    w, angular, turn = _weighed(factor, d)
+    blocks = [([-w, w, -w * factor.z[:, None, :d]], [rows.position[i], rows.position[j], rows.rotation[i]])]
+    if factor.measurement.compares_poses:
+        blocks.append(([-angular * turn, angular * np.eye(d)], [rows.rotation[i], rows.rotation[j]]))
+    return blocks
 
 
 TERMS = {

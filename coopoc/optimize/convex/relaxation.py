@@ -14,7 +14,7 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.linalg import eigh, eigvalsh, svd
+from numpy.linalg import eigh, eigvalsh
 
 from ...arrays import Bools, Floats
 from ...errors import InputError, said
@@ -199,11 +199,11 @@ def shor(problem: Problem) -> Relaxation:
     reduced = Reduced(form)
     block, sphere, Z = semidefinite(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
     bound = reduced.lower_bound(Multipliers(form, block, sphere))[0]
-    values, vectors = eigh(Z)
-    Y, d, space = vectors * np.sqrt(np.maximum(values, 0.0)), form.columns, problem.space
-    _, values, rows = svd(Y, full_matrices=False)
-    gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
-    x = space.join(*form.drop(reduced.settle(form.project(np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))))))
+    values, vectors = (each[..., ::-1] for each in eigh(Z))
+    values, d, space = np.append(np.maximum(values, 0.0), np.zeros(form.columns)), form.columns, problem.space
+    gap = float(values[d] / max(values[d - 1], 1e-300))
+    top = np.pad(vectors, ((0, 0), (0, d)))[:, :d] * np.sqrt(values[:d])
+    x = space.join(*form.drop(reduced.settle(form.project(top))))
     solution = solve(replace(problem, x0=x), throw=False)
     X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
     # the refined point's own bound never exceeds Shor's but by what the solver lacks
