@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints
+from ...arrays import Floats, Ints
 from ...workers import one_thread
 
 THREADED_UNKNOWNS = 64
@@ -94,13 +94,6 @@ def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
 def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
     """(u, K) A^-1 right, column by column."""
     return np.column_stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T])
-
-
-def with_still(matrix: Any, added: Floats | Bools) -> Any:
-    """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
-    from scipy.sparse import diags_array
-
-    return matrix + diags_array(np.asarray(added, float).ravel())
 
 
 @lru_cache(maxsize=3)

@@ -173,18 +173,14 @@ _LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
 """Of large ones the problem that is at hand and those that differ from it in numbers alone."""
 
 
-def shared_layout(structure: Structure) -> Layout:
-    """The layout of a structure, shared by its problems."""
+def layout_of(structure: Structure) -> Layout:
+    """The layout of a structure without its constraints, shared by its problems."""
+    structure = structure._replace(constraints=())
     if structure.nodes * structure.space.dof <= SMALL_UNKNOWNS:
         return _small(structure)
     if (layout := _LARGE.get(structure)) is None:
         layout = _LARGE[structure] = Layout(structure)
     return layout
-
-
-def layout_of(problem: Problem) -> Layout:
-    """The layout of a problem, without its constraints."""
-    return shared_layout(structure_of(problem)._replace(constraints=()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +248,6 @@ def sparse(problem: Problem) -> Sparse:
     """
     kept = problem.__dict__.get("sparse")
     if kept is None:
-        kept = Sparse(problem.space, layout_of(problem), tuple(map(numbers_of, problem.factors)))
+        kept = Sparse(problem.space, layout_of(structure_of(problem)), tuple(map(numbers_of, problem.factors)))
         problem.__dict__["sparse"] = kept
     return kept

@@ -1,6 +1,6 @@
 """Assessment of a point independently of its solver: covariance, free nodes, curvature, plausible cost."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import TYPE_CHECKING, Any
@@ -11,8 +11,8 @@ from numpy.linalg import LinAlgError, eigh, norm, qr
 
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
-from ..algebra.cholesky import cholesky_of, columns_solved, with_still
-from ..algebra.sparse import Entries, shared_layout, sparse, structure_of
+from ..algebra.cholesky import cholesky_of, columns_solved
+from ..algebra.sparse import Entries, layout_of, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, stacked, unchecked
 from ..model.problem import Problem, linearised, several
@@ -94,16 +94,14 @@ def assess(problem: Problem, x: Floats, covariance: bool = True, quick: bool = F
     if not problem.constraints:
         return _unconstrained(problem, x, covariance, quick and not problem.linear)
     (linear, J), still = linearised(problem, x), ~problem.movable
-    gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
+    gradient = J.T @ stacked(r.ravel() for r in linear.residual)
     active = active_at(problem, x, gradient.reshape(still.shape))
     size = float(norm(gradient + active.rows.matrix.T @ active.multipliers))
     try:
-        cov, dx, sound = _marginals(J, still, gradient, active)
+        cov, dx = _marginals(J, still, gradient, active)
         if (stated := as_stated(problem)) is not problem:
             cov = _marginals(linearised(stated, x)[1], still, gradient, active)[0]
     except LinAlgError:
-        sound = False
-    if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
         free = _unobservable(problem, J, active)
         return Assessment(linear.cost, size, np.full((*still.shape, still.shape[1]), nan), nan, free, active)
     cov = cov * ~(still[:, :, None] | still[:, None, :])
@@ -185,38 +183,32 @@ def _symmetric(entries: Entries, values: Floats) -> Any:
     return half + triu(half, 1).T
 
 
-def _marginals(J: Any, still: Bools, gradient: Floats, active: Active) -> tuple[Floats, Floats, bool]:
-    """Marginals under the equalities, the Gauss-Newton step along what holds, and whether the former are bounded.
+def _marginals(J: Any, still: Bools, gradient: Floats, active: Active) -> tuple[Floats, Floats]:
+    """Marginals under the equalities, and the Gauss-Newton step along what holds.
 
     With Z the directions that remain: cov = Z (Z^T J^T J Z)^-1 Z^T, and the step solves the same system after the least
     step onto what holds.
 
     Raises:
-        numpy.linalg.LinAlgError: a matrix that is not positive definite.
+        numpy.linalg.LinAlgError: a matrix is not positive definite, or a variance not bounded.
     """
-    exact, onto, hessian, shape = active.exact, active.onto, with_still(J.T @ J, still), still.shape
-    dx = onto - _within(hessian, active.along)[0](gradient + hessian @ onto)
-    solve, own = _within(hessian, exact)
-    cov = np.zeros((*shape, shape[1]))
-    for i, c in np.ndindex(*shape):
-        unit = np.zeros(shape)
-        unit[i, c] = 1.0
-        cov[i, :, c] = solve(unit.ravel()).reshape(shape)[i]
-    inflation = own * np.einsum("nii->ni", cov).ravel()
-    moves = exact.power(2).sum(1) > 1e-9
-    sound = ((own > 1e-13 * own.max(initial=0.0)) & (inflation > 0) & (inflation < INFLATION))[moves].all()
-    return cov, dx, bool(sound)
+    from scipy.sparse import diags_array
 
-
-def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats]:
-    """Z (Z^T H Z)^-1 Z^T of directions Z (n dof, k) as a function, and the diagonal of H seen along Z."""
-    if not ways.shape[1]:
-        return np.zeros_like, np.zeros(ways.shape[0])
-    reduced = ways.T @ hessian @ ways
-    factored = cholesky_of(reduced)
-    if factored is None:
+    along, exact, onto = active.along, active.exact.tocsr(), active.onto
+    hessian = J.T @ J + diags_array(still.ravel().astype(float))
+    within = [ways.T @ hessian @ ways for ways in (along, exact)]
+    free, held = map(cholesky_of, within)
+    if free is None or held is None:
         raise LinAlgError("not positive definite")
-    return lambda rhs: ways @ factored.solve(ways.T @ rhs), (ways @ reduced @ ways.T).diagonal()
+    dx = onto - along @ free.solve(along.T @ (gradient + hessian @ onto))
+    nodes = [exact[rows] for rows in np.arange(still.size).reshape(still.shape)]
+    cov = np.array([ways @ columns_solved(held, ways.T.toarray()) for ways in nodes])
+    own = (exact @ within[1] @ exact.T).diagonal()
+    inflation = own * np.einsum("nii->ni", cov).ravel()
+    sound = (own > 1e-13 * own.max(initial=0.0)) & (inflation > 0) & (inflation < INFLATION)
+    if not (sound[exact.power(2).sum(1) > 1e-9].all() and np.isfinite(dx).all()):
+        raise LinAlgError("not bounded")
+    return cov, dx
 
 
 def _unobservable(
@@ -286,7 +278,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
         return ways[:, values <= 1e-10 * values.max(initial=1.0)].T
     shift, factored = 1e-12, None
     while factored is None:
-        factored, shift = cholesky_of(with_still(square, np.full(len(length), shift))), 10.0 * shift
+        factored, shift = cholesky_of(square + diags_array(np.full(len(length), shift))), 10.0 * shift
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
         ways = qr(columns_solved(factored, ways))[0]
@@ -345,7 +337,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
         weight[rows[own, 1], rows[own, 2]] = active.multipliers[own]
         numbers.append(numbers_of(reweighed(as_factor(item), weight)))
         terms.append(term._replace(kind=term.kind._replace(bound=True)))
-    layout = shared_layout(structure._replace(factors=tuple(terms), constraints=()))
+    layout = layout_of(structure._replace(factors=tuple(terms)))
     entries, values = layout.entries, layout.total("newton", x, numbers)[system.size + 1 : -1]
     values[entries.diagonal] += SLACK * system.quadratic(x, "gauss-newton")[2][system.entries.diagonal]
     moving = problem.movable.ravel()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from ...arrays import Floats
-from ..algebra.sparse import Layout, layout_of, sparse
+from ..algebra.sparse import Sparse, sparse
 from ..assess.active import constraint_rows
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, Capabilities, SolverResult
 from ..descent.levenberg_marquardt import arrive
@@ -59,8 +59,8 @@ def solver(
     >>> solve(problem.constrain("displacement", ("a", "b"), upper=[7, 9, 9]), "osqp").x.round(3)[:, 0]
     array([1., 8.])
     """
-    system, layout, held = sparse(problem), layout_of(problem), bool(problem.constraints)
-    programme = _programme(problem, layout)
+    system, held = sparse(problem), bool(problem.constraints)
+    programme = _programme(problem, system)
     if held:
         try:
             x, feasible = _nearest(problem, x)
@@ -104,7 +104,14 @@ class Programme:
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
         """
-        self.update(values, q, lower, upper)
+        import osqp
+
+        if self._workspace is None:
+            self._workspace, self._pattern.data = osqp.OSQP(), values
+            self._workspace.setup(self._pattern, q, self._rows, lower, upper, **SETTINGS)
+        else:
+            self._polish(False)
+            self._workspace.update(Px=values, q=q, l=lower, u=upper)
         for attempt in range(REPAIRS + 1):
             end = self._workspace.solve(raise_error=False)
             if end.info.status.startswith("primal infeasible"):
@@ -116,17 +123,6 @@ class Programme:
             self.repairs += attempt < REPAIRS and self._polishing >= active
             self._polish(active)
         raise LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
-
-    def update(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> None:
-        """Put numbers into the workspace, which the first ones set up."""
-        import osqp
-
-        if self._workspace is None:
-            self._workspace, self._pattern.data = osqp.OSQP(), values
-            self._workspace.setup(self._pattern, q, self._rows, lower, upper, **SETTINGS)
-            return
-        self._polish(False)
-        self._workspace.update(Px=values, q=q, l=lower, u=upper)
 
     def _polish(self, wanted: bool) -> None:
         """Whether OSQP solves for its active set exactly; without one it would print a message."""
@@ -146,11 +142,11 @@ class Programme:
         return bool((abs(value - met) <= BOUND_TOLERANCE).all())
 
 
-def _programme(problem: Problem, layout: Layout) -> Programme:
+def _programme(problem: Problem, system: Sparse) -> Programme:
     """The programme of a problem with its constraints, which are linear."""
     from scipy.sparse import csc_matrix
 
-    entries = layout.entries
+    entries = system.entries
     pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
     matrix = csc_matrix((0, entries.size))
     if problem.constraints:
