@@ -41,7 +41,7 @@ def test_derivatives_equal_torchs(kind, dimension):
     problem = Problem(tuple(map(str, range(3 * COUNT))), dimension=d, poses=tuple(range(3 * COUNT)))
     problem = problem.add(kind, nodes, z, std=1.0, constants=constants if known.constants else None)
     linear = problem.linearise(x := x.reshape(3 * COUNT, -1))
-    ours = np.concatenate(linear.jacobian[0], -1)
+    (ours,) = linear.jacobian
     for k in range(COUNT):
         given = [torch.tensor(a) for a in (x[nodes[k]], z[k], constants[k])]
         steps = torch.zeros((known.arity, space.dof), dtype=torch.float64)

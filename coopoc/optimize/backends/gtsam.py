@@ -226,8 +226,8 @@ def callbacks(problem: Problem, factors: Sequence[Factor]) -> Callable[[int, int
                 at, x = gtsam.Values(estimates), estimate(space, posed, estimates)
                 linear, turned = linearise(space, bare, None, x), tangent(space, posed, x)
             if jacobians is not None:
-                for slot, i in enumerate(nodes):
-                    jacobians[slot] = linear.jacobian[k][slot][row] @ turned[i]
+                for slot, own in enumerate(np.split(linear.jacobian[k][row], len(nodes), axis=1)):
+                    jacobians[slot] = own @ turned[nodes[slot]]
             return linear.residual[k][row]
 
         return error

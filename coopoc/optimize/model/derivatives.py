@@ -16,7 +16,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from .factor import LOSSES, Factor, Loss
-from .measurements import CONVERTED, Measurement, converted_rows
+from .measurements import CONVERTED, Measurement, converted_rows, product
 from .space import Space
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def residual_of(kind: Kind, converted: bool = False) -> tuple[list[Any], Any]:
         local = _local(measurement, places)
         if vectors:
             distance, rows = converted_rows(z, m)
-            gap = [sum(a * v for a, v in zip(row, local, strict=True)) for row in rows]
+            [gap] = product([local], zip(*rows, strict=True))
             gap[0] -= distance
         else:  # angles in [-pi, pi]: the derivative of the remainder is 1
             parts = zip(measurement.residual(local, z, assumed, m), measurement.angles(d), strict=True)
@@ -206,7 +206,7 @@ def _moved(space: Space, node: Numbers, step: Numbers, origin: dict[int, Any]) -
     at = [node[k] - origin.get(k, 0.0) + step[k] for k in range(d)]
     if not space.has_rotation:
         return at, []
-    return at, _product([node[d + d * i :][:d] for i in range(d)], cayley(step[d:]))
+    return at, product([node[d + d * i :][:d] for i in range(d)], cayley(step[d:]))
 
 
 def cayley(w: Numbers) -> list[Numbers]:
@@ -219,13 +219,9 @@ def cayley(w: Numbers) -> list[Numbers]:
     x, y, z = w
     zero = 0.0 * x
     skew = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    twice = _product(skew, skew)
+    twice = product(skew, skew)
     share = 1.0 / (1.0 + 0.25 * (x * x + y * y + z * z))
     return [[float(i == j) + share * (skew[i][j] + 0.5 * twice[i][j]) for j in range(3)] for i in range(3)]
-
-
-def _product(a: Any, b: Any) -> list[Numbers]:
-    return [[sum(p * q for p, q in zip(row, column, strict=True)) for column in zip(*b, strict=True)] for row in a]
 
 
 def _local(measurement: Measurement, places: list[tuple[Numbers, list[Numbers]]]) -> Numbers:
@@ -236,8 +232,8 @@ def _local(measurement: Measurement, places: list[tuple[Numbers, list[Numbers]]]
         return vector
     if measurement.frame == "nodes" or measurement.arity == 1:
         return [c for at, turned in places for row in (at, *turned) for c in row]
-    [vector] = _product([vector], body)
-    turned = _product(zip(*body, strict=True), other)
+    [vector] = product([vector], body)
+    turned = product(zip(*body, strict=True), other)
     return vector if measurement.frame == "body" else [*vector, *(c for row in turned for c in row)]
 
 
@@ -331,12 +327,12 @@ class Linear:
 
     Args:
         residual: per factor (M, size).
-        jacobian: per factor and node (M, size, dof).
+        jacobian: per factor (M, size, arity dof).
         cost: 1/2 sum of rho.
     """
 
     residual: tuple[Floats, ...]
-    jacobian: tuple[tuple[Floats, ...], ...]
+    jacobian: tuple[Floats, ...]
     cost: float
 
 
@@ -344,31 +340,25 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
     """Factors around x (n, ambient); what is not `movable` (n, dof) has no derivative."""
     from ...kernels.graphs.graph_tape import accumulate
 
-    residuals, jacobians, cost, dof = [], [], 0.0, space.dof
+    wholes, cost = [], 0.0
     for factor in factors:
-        (rows, arity), size = factor.nodes.shape, factor.size
-        kind, end = Kind(factor.measurement, space, factor.std is None), size * rows
-        total = np.zeros((1 + arity * dof) * end)
-        accumulate(write(kind, "jacobian").tape, x, factor.nodes, numbers_of(factor), _goal(kind, rows), total)
-        residual, jacobian = total[:end].reshape(rows, size), tuple(total[end:].reshape(arity, rows, size, dof))
-        square = np.vecdot(residual, residual)
+        nodes, kind = factor.nodes, Kind(factor.measurement, space, factor.std is None)
+        whole = np.zeros((len(nodes), factor.size, 1 + nodes.shape[1] * space.dof))
+        tape, goal = write(kind, "jacobian").tape, _goal(kind, *whole.shape)
+        accumulate(tape, x, nodes, numbers_of(factor), goal, whole.reshape(-1))
+        square = np.vecdot(whole[..., 0], whole[..., 0])
         if factor.loss is not None:
-            root = np.sqrt(factor.loss.weight(square))[:, None]
-            residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)
+            whole *= np.sqrt(factor.loss.weight(square))[:, None, None]
             square = factor.loss.cost(square)
         cost += 0.5 * float(square.sum())
         if movable is not None:
-            jacobian = tuple(s * movable[n][:, None] for s, n in zip(jacobian, factor.nodes.T, strict=True))
-        residuals.append(residual)
-        jacobians.append(jacobian)
-    return Linear(tuple(residuals), tuple(jacobians), cost)
+            whole[..., 1:] *= movable[nodes].reshape(len(nodes), 1, -1)
+        wholes.append(whole)
+    return Linear(tuple(w[..., 0] for w in wholes), tuple(w[..., 1:] for w in wholes), cost)
 
 
 @lru_cache(maxsize=64)
-def _goal(kind: Kind, rows: int) -> Any:
-    """(outputs, rows) int32, where a tape's outputs go: residuals (rows, size), Jacobians (arity, rows, size, dof)."""
-    size, dof = kind.measurement.size(kind.space.dimension), kind.space.dof
+def _goal(kind: Kind, rows: int, size: int, width: int) -> Any:
+    """(outputs, rows) int32, where a tape's outputs go: (rows, size, width) residuals, each before its derivatives."""
     component, column = write(kind, "jacobian").entries.T
-    node, direction = np.divmod(column, dof)
-    first = np.where(column < 0, component, size * rows * (1 + node * dof) + component * dof + direction)
-    return (first[:, None] + np.where(column < 0, size, size * dof)[:, None] * np.arange(rows)).astype(np.int32)
+    return ((component * width + 1 + column)[:, None] + size * width * np.arange(rows)).astype(np.int32)

@@ -104,7 +104,7 @@ def check_std(measurement: Measurement, std: ArrayLike | float, shape: tuple[int
     field, size = f"std of {measurement.name}", shape[-1]
     array = checked(field, std)
     wide = np.full((1, size), array) if array.ndim < 2 and array.size in (1, size) else array
-    if wide.ndim != 2 or wide.shape[1] != size or len(wide) not in (1, shape[0]):
+    if wide.shape not in ((1, size), shape):
         allowed = f"must have shape ({size},) or {shape}"
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
     refuse(field, wide, ~(wide > 0), "must be > 0", "Give standard deviations; infinity means no information.")
@@ -118,7 +118,7 @@ def check_root(field: str, root: ArrayLike, shape: tuple[int, int]) -> Floats:
     """cov, or sqrt_information, as (M or 1, size, size), finite."""
     array, size = checked(field, root), shape[-1]
     array = array[None] if array.ndim == 2 else array
-    if array.ndim != 3 or array.shape[1:] != (size, size) or len(array) not in (1, shape[0]):
+    if array.shape not in ((1, size, size), (*shape, size)):
         allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"
         raise InputError(field, array.shape, allowed, "Give one matrix, or one for each measurement.")
     refuse(field, array, ~np.isfinite(array), "must be finite", "Invert a positive definite covariance.")
@@ -138,6 +138,8 @@ LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, floa
 """rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
 
 DEGREES = "This looks like degrees: use np.deg2rad."
+BY_ROW = "nodes", "z", "std", "sqrt_information", "constants"
+"""Arrays of a factor that have an entry for each measurement, or one for all."""
 DEPENDENT_VOLUME = 1e-12
 """Volume of the rows of W, as a share of that of rows at right angles, up to which some may be of no rank."""
 
@@ -288,8 +290,7 @@ def _checked(item: "Factor | Constraint") -> Measurement:
         raise InputError("nodes", nodes[same][0].tolist(), "must be different points", hint)
     constants = checked(f"constants of {measurement.name}", [] if item.constants is None else item.constants)
     count, own = len(nodes), measurement.constants
-    fits = constants.ndim in (1, 2) and constants.shape[-1] == own and constants.size in (own, count * own)
-    if not fits or not np.isfinite(constants).all():
+    if constants.shape not in ((own,), (1, own), (count, own)) or not np.isfinite(constants).all():
         hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
         raise InputError("constants", constants.tolist(), f"must be {own} finite numbers for {measurement.name}", hint)
     wide = frozen(np.full((count, own), constants))
@@ -325,10 +326,10 @@ def taken(factor: Factor, rows: Ints) -> Factor:
     """Some measurements of a factor."""
     parts = {
         name: array[rows]
-        for name in ("z", "std", "sqrt_information", "constants")
+        for name in BY_ROW
         if (array := getattr(factor, name)) is not None and len(array) == len(factor.nodes)
     }
-    return unchecked(factor, nodes=factor.nodes[rows], **parts)
+    return unchecked(factor, **parts)
 
 
 def reweighed(factor: Factor, share: Floats | float) -> Factor:
@@ -354,12 +355,11 @@ def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
 def _joined(factors: list[Factor]) -> Factor:
     if len(factors) == 1:
         return factors[0]
-    changes = {"nodes": np.concatenate([factor.nodes for factor in factors])}
-    for name in ("z", "std", "sqrt_information", "constants"):
-        arrays = [getattr(factor, name) for factor in factors]
-        if arrays[0] is not None:
-            wide = [np.broadcast_to(a, (len(f.nodes), *a.shape[1:])) for a, f in zip(arrays, factors, strict=True)]
-            changes[name] = np.concatenate(wide)
+    changes = {}
+    for name in BY_ROW:
+        if getattr(factors[0], name) is not None:
+            own = ((len(f.nodes), getattr(f, name)) for f in factors)
+            changes[name] = np.concatenate([np.broadcast_to(a, (count, *a.shape[1:])) for count, a in own])
     return unchecked(factors[0], **changes)
 
 

@@ -229,6 +229,11 @@ def antenna(node: Any, arm: Any, m: Any = np) -> Sequence[Any]:
     return [at[i] + sum(turned[i][j] * arm[j] for j in range(3)) for i in range(3)]
 
 
+def product(a: Any, b: Any) -> list[list[Any]]:
+    """Rows of a matrix product in any namespace."""
+    return [[sum(p * q for p, q in zip(row, column, strict=True)) for column in zip(*b, strict=True)] for row in a]
+
+
 PLANES = ((1, 2), (2, 0), (0, 1))
 """Axes about which x, y and z turn."""
 
@@ -237,8 +242,7 @@ def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequ
     """Rz^T (t - tz) and Log(Rz^T R), the error of a relative pose (t, R) against a measured (tz, Rz): m, rad."""
     *at, turned = measured
     gap = [x - at[0], y - at[1], z - at[2]]
-    moved = [sum(turned[k][i] * gap[k] for k in range(3)) for i in range(3)]
-    error = [[sum(turned[k][i] * R[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    [moved], error = product([gap], turned), product(zip(*turned, strict=True), R)
     half = [0.5 * (error[j][i] - error[i][j]) for i, j in PLANES]
     sine = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     cosine = 0.5 * (error[0][0] + error[1][1] + error[2][2] - 1.0)

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import compress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,14 +12,13 @@ from numpy.typing import ArrayLike
 from ...arrays import Bools, Floats, Ints, checked, frozen, listed, remade, texts
 from ...errors import InputError, shown, suggestion
 from .derivatives import Linear, linearise
-from .factor import Constraint, Factor, check_rotations, check_std, stacked, taken, unchecked
+from .factor import Constraint, Factor, Loss, check_rotations, check_std, stacked, unchecked
 from .measurements import lookup
 from .space import Space
 from .window import Noise, window
 
 if TYPE_CHECKING:
     from ...world.recording import Recording
-    from .factor import Loss, check_std
 
 DERIVED = (
     ("_place", {"names"}),
@@ -97,8 +95,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         for field in ("names", "factors", "poses", "fixed", "constraints"):
-            if not isinstance(value := getattr(self, field), tuple):
-                self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
+            self.__dict__[field] = tuple(listed(field, getattr(self, field), "Give a tuple, () for none."))
         names = tuple(map(str, self.names))
         if names != tuple(map(str, range(len(names)))):
             texts("names", [*self.names])  # other whole numbers would look like indices
@@ -164,7 +161,7 @@ class Problem:
         cov: ArrayLike | None = None,
         sqrt_information: ArrayLike | None = None,
         constants: ArrayLike | None = None,
-        loss: "Loss | None" = None,
+        loss: Loss | None = None,
     ) -> "Problem":
         """The problem with one more measurement, or with M of one kind; the arguments are those of Factor.
 
@@ -212,7 +209,7 @@ class Problem:
     def _check(self, item: Factor | Constraint) -> None:
         """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
         measurement, nodes = item.measurement, item.nodes
-        if len(beyond := nodes[(nodes < 0) | (nodes >= len(self.names))]):
+        if len(beyond := nodes[nodes >= len(self.names)]):
             raise no_such_node(int(beyond[0]), self.names)
         if item.dimension not in (None, self.dimension):
             hint = f"Make it with Problem(names, dimension={item.dimension})." if measurement.plane else "Leave it out."
@@ -352,8 +349,7 @@ def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:
     """`Problem.linearise` at x (n, ambient), which need not be checked, and the sparse Jacobian (rows, n dof), CSR."""
     linear, (n, dof) = linearise(problem.space, problem.factors, problem.movable, x), problem.movable.shape
     columns = [(dof * f.nodes[:, :, None] + np.arange(dof)).reshape(len(f.nodes), -1) for f in problem.factors]
-    values = [np.concatenate(jacobians, axis=2) for jacobians in linear.jacobian]
-    return linear, row_matrix(zip(values, columns, strict=True), n * dof)
+    return linear, row_matrix(zip(linear.jacobian, columns, strict=True), n * dof)
 
 
 def row_matrix(blocks: Iterable[tuple[Floats, Ints]], width: int) -> Any:
@@ -367,30 +363,6 @@ def row_matrix(blocks: Iterable[tuple[Floats, Ints]], width: int) -> Any:
         lengths.append(np.full(values[..., 0].size, own.shape[1]))
     starts = np.append(0, np.cumsum(stacked(lengths)))
     return csr_array((stacked(data), stacked(columns), starts), shape=(len(starts) - 1, width))
-
-
-def rows_among(problem: Problem, used: Bools) -> list[Ints]:
-    """Of each factor, the rows whose nodes are all used (n,)."""
-    return [np.flatnonzero(used[factor.nodes].all(1)) for factor in problem.factors]
-
-
-def restricted(problem: Problem, used: Bools, x: Floats, rows: Sequence[Ints]) -> Problem:
-    """The problem of some nodes, from x.
-
-    Args:
-        problem: of all.
-        used: (n,) which nodes.
-        x: (n, ambient).
-        rows: of each factor, among the nodes that are used.
-    """
-    number = np.cumsum(used) - 1
-    kept = [taken(factor, own) for factor, own in zip(problem.factors, rows, strict=True) if len(own)]
-    changes = {
-        name: tuple(number[[k for k in getattr(problem, name) if used[k]]].tolist()) for name in ("poses", "fixed")
-    }
-    changes["names"] = tuple(compress(problem.names, used))
-    changes["factors"] = tuple(unchecked(factor, nodes=number[factor.nodes]) for factor in kept)
-    return problem.replace_unchecked(**changes, x0=frozen(x[used]), shown=0)
 
 
 def points(space: Space, n: int, field: str, x: ArrayLike) -> Floats:

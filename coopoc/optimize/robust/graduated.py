@@ -12,7 +12,7 @@ from numpy import inf
 from numpy.typing import ArrayLike
 
 from ...arrays import TINY, AnyArray, Floats, Ints, checked, frozen, number, plain
-from ...errors import InputError, shown
+from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..assess.assess import squared
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE
@@ -74,20 +74,19 @@ class Marked:
 
 def mark(problem: Problem, candidates: Candidates, groups: ArrayLike | None = None) -> Marked:
     """The problem with its candidates, checked; their bounds are yet to be given."""
-    places = []
+    places, last = [], len(problem.factors) - 1
+    allowed = f"a factor in 0..{last} or (factor, rows)"
     for item in candidates if isinstance(candidates, Sequence) else [candidates]:
         k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
-        if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 0 <= k < len(problem.factors):
-            allowed = f"must be a factor in 0..{len(problem.factors) - 1} or (factor, rows)"
-            raise InputError("candidates", shown(item), allowed, "See problem.factors.")
+        k = number("candidates", k, 0, last, kind=int, allowed=allowed, hint="See problem.factors.")
         factor = problem.factors[k]
         if factor.loss is not None:
-            allowed = f"has a {factor.loss.name} loss already"
-            raise InputError("candidates", repr(factor), allowed, "Leave its loss out.")
+            lacks = f"has a {factor.loss.name} loss already"
+            raise InputError("candidates", repr(factor), lacks, "Leave its loss out.")
         chosen = range(len(factor.nodes)) if rows is None else checked("candidates", rows, "(M,)", (-1,), int).tolist()
         if bad := [r for r in chosen if not 0 <= r < len(factor.nodes)]:
             raise InputError("candidates", bad[:3], f"must be rows of {factor!r}", "Rows count from 0.")
-        places += [(int(k), r) for r in chosen]
+        places += [(k, r) for r in chosen]
     if not places or len(set(places)) < len(places):
         hint = "Name the factors that may hold outliers."
         raise InputError("candidates", list(candidates)[:3], "must name measurements, each once", hint)

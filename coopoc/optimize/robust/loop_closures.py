@@ -115,17 +115,15 @@ def predicted(marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats
     for k in np.unique(marked.factor):
         here = marked.factor == k
         factor = taken(problem.factors[k], marked.row[here])
-        with np.errstate(all="ignore"):
-            linear = linearise(problem.space, [factor], None, x)
-        J, r = np.concatenate(linear.jacobian[0], axis=2), linear.residual[0]
-        # an angle between nodes that coincide has no derivative
-        lost = ~np.isfinite(r).all(1) | ~np.isfinite(J).all(axis=(1, 2))
-        r, J = np.where(lost[:, None], 0.0, r), np.where(lost[:, None, None], 0.0, J)
-        free, *pairs = pairs_of(system.entries.number[factor.nodes].reshape(len(J), -1))
+        free, *pairs = pairs_of(system.entries.number[factor.nodes].reshape(len(factor.nodes), -1))
         P = np.zeros(free.shape)
         P[free] = system.cholesky.inverse(*pairs)
-        S = J @ P @ J.mT + np.eye(factor.size)
-        lost |= ~np.isfinite(S).all(axis=(1, 2))
+        with np.errstate(all="ignore"):
+            linear = linearise(problem.space, [factor], None, x)
+            (J,), (r,) = linear.jacobian, linear.residual
+            S = J @ P @ J.mT + np.eye(factor.size)
+        # an angle between nodes that coincide has no derivative
+        lost = np.asarray(~np.isfinite(np.dstack([r, S])).all(axis=(1, 2)))
         variance, axes = np.linalg.eigh(np.where(lost[:, None, None], np.eye(factor.size), S))
         variance = np.maximum(variance, 1.0)  # as it is but for rounding, of nodes that are nearly free
         distance[here] = np.where(lost, np.inf, (np.einsum("mkj,mk->mj", axes, r) ** 2 / variance).sum(1))

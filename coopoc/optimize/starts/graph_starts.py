@@ -1,7 +1,7 @@
 """Starts of a graph: chained odometry, a spanning tree, points by trilateration, and one that grows with the drive."""
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import combinations
+from itertools import combinations, compress
 
 import numpy as np
 from numpy.linalg import norm, pinv, svd
@@ -12,8 +12,8 @@ from ...formats.graph import Graph, PointEdges, PoseEdges
 from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
-from ..model.factor import stacked
-from ..model.problem import Problem, restricted, rows_among
+from ..model.factor import stacked, taken, unchecked
+from ..model.problem import Problem
 from ..model.space import Space, carried, exp, log, nearest_rotation
 
 Roots = Iterable[tuple[int, Floats, Floats]]
@@ -349,12 +349,19 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
 def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Problem, Bools]:
     """The problem from x (n, ambient) of the nodes that are `free` (n,) with their neighbours among the `used`, which
     are fixed, and which nodes it has."""
-    rows = [k[free[f.nodes[k]].any(1)] for f, k in zip(problem.factors, rows_among(problem, used), strict=True)]
-    kept = free.copy()
-    for f, own in zip(problem.factors, rows, strict=True):
-        kept[f.nodes[own]] = True
-    part = restricted(problem, kept, x, rows)
-    return part.replace_unchecked(fixed=tuple(sorted({*part.fixed, *np.flatnonzero((~free)[kept]).tolist()}))), kept
+    factors = [taken(f, np.flatnonzero(used[f.nodes].all(1) & free[f.nodes].any(1))) for f in problem.factors]
+    kept, still = free.copy(), ~free
+    kept[stacked(f.nodes.ravel() for f in factors)] = True
+    still[list(problem.fixed)] = True
+    number = np.cumsum(kept) - 1
+    part = problem.replace_unchecked(
+        names=tuple(compress(problem.names, kept)),
+        factors=tuple(unchecked(f, nodes=number[f.nodes]) for f in factors if len(f.nodes)),
+        poses=tuple(number[[k for k in problem.poses if kept[k]]].tolist()),
+        fixed=tuple(np.flatnonzero(still[kept]).tolist()),
+        x0=x[kept],
+    )
+    return part, kept
 
 
 def _stages(graph: Graph) -> int:

@@ -75,7 +75,7 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
     with np.errstate(all="ignore"):
         linear, undefined = linearise(problem.space, items, problem.movable, x), []
     for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
-        bad = (count & ~np.isfinite(np.dstack([residual, *jacobian])).all(2)).any(1)
+        bad = (count & ~np.isfinite(np.dstack([residual, jacobian])).all(2)).any(1)
         undefined += [(item, item.nodes[bad])] if bad.any() else []
     return undefined
 
@@ -113,7 +113,7 @@ def graph_of(problem: Problem) -> Graph:
         edges[field] = edges_of(field, nodes, values, covariance, ())
     names, still = problem.names, list(problem.fixed)
     at, orientation = np.full((n, d), np.nan), np.full((n, 1 if d == 2 else 4), np.nan)
-    if problem.x0 is not None and problem.poses:
+    if problem.x0 is not None:
         held = problem.x0[still]
         at[still], orientation[still] = problem.space.position(held), to_orientation(problem.space.rotation(held))
     if not all(map(NAME.fullmatch, names)):

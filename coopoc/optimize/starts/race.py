@@ -133,7 +133,8 @@ def race(
             if sure or (cost <= limit and alike):
                 name, x = next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME_COST * cost)
                 return ended(name, x, True)
-            straight |= {name} if end.converged else set()
+            if end.converged:
+                straight.add(name)
     if "eased" in late and not straight and least_of_all() > NEAR_COST * limit:  # with ranges it grows first
         y = follow("incremental", np.asarray(problem.x0))
         if explained(y):
