@@ -189,7 +189,7 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
     if name not in commands:
         raise unknown("command", name, commands)
     command = commands[name]
-    loaded = command.load() if isinstance(command, EntryPoint) else command
+    loaded = plugins.load(command, f"{prog} {name}") if isinstance(command, EntryPoint) else command
     if loaded is run and {"-h", "--help"} & {*rest} and not rest[0].startswith("-"):
         print(_settings(rest[0]))
     if isinstance(loaded, Mapping):

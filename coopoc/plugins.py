@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from .errors import InputError, missing, suggestion, unknown
+from .errors import InputError, MissingLibraryError, missing, said, suggestion, unknown
 
 GROUPS = {
     "coopoc.datasets": "data set",
@@ -43,11 +43,15 @@ def points(group: str) -> Mapping[str, metadata.EntryPoint]:
     """
     entry_points: dict[str, metadata.EntryPoint] = {}
     for point in _installed(group, tuple(sys.path)):
-        other = entry_points.setdefault(point.name, metadata.EntryPoint(point.name, point.value, point.group))
-        if other.value != point.value:
-            claims = f"is claimed by {other.value} and {point.value}"
-            raise InputError(group, repr(point.name), claims, "Uninstall one of the two.")
+        _claim(entry_points, point.name, metadata.EntryPoint(point.name, point.value, point.group))
     return entry_points
+
+
+def _claim(taken: dict[str, metadata.EntryPoint], name: str, point: metadata.EntryPoint) -> None:
+    other = taken.setdefault(name, point).value
+    if other != point.value:
+        claims = f"is claimed by {other} and {point.value}"
+        raise InputError(point.group, repr(name), claims, "Uninstall one of the two.")
 
 
 @lru_cache(64)
@@ -64,11 +68,17 @@ def names(group: str) -> tuple[str, ...]:
     >>> isinstance(names("coopoc.methods"), tuple)
     True
     """
-    every: list[str] = []
+    return tuple(sorted(holders(group)))
+
+
+def holders(group: str) -> Mapping[str, metadata.EntryPoint]:
+    """The entry point that holds each name of a group; InputError if two do."""
+    every: dict[str, metadata.EntryPoint] = {}
     for name, point in points(group).items():
         written = names_in(point.value)
-        every += (_members(point) if written is None else written) or [name]
-    return tuple(sorted(every))
+        for each in (_members(point) if written is None else written) or [name]:
+            _claim(every, each, point)
+    return every
 
 
 @cache
@@ -155,17 +165,12 @@ def find(group: str, name: str) -> Any:
     """
     if not isinstance(name, str):
         raise _unknown(group, name)
-    registered = points(group)
-    loaded = _load(registered[name], name) if name in registered else None
-    if loaded is not None and not isinstance(loaded, Mapping):
-        return loaded
+    point = holders(group).get(name)
+    if point is not None:
+        loaded = load(point, name)
+        return loaded[name] if isinstance(loaded, Mapping) else loaded
     if in_file(name):
         return from_file(name, GROUPS.get(group, group))
-    for point in registered.values():
-        written = names_in(point.value)
-        members = _members(point) if written is None else _load(point, name) if name in written else {}
-        if name in members:
-            return members[name]
     raise _unknown(group, name)
 
 
@@ -184,11 +189,21 @@ def called(group: str, name: str, hint: str, *arguments: Any) -> Any:
         raise InputError(GROUPS[group], repr(name), f"cannot be called: {error}", hint) from error
 
 
-def _load(point: metadata.EntryPoint, name: str) -> Any:
+def load(point: metadata.EntryPoint, name: str) -> Any:
+    """What an entry point names, for one of its names.
+
+    Raises:
+        InputError: a broken one.
+        MissingLibraryError: a library that it needs is not installed.
+    """
     try:
         return point.load()
-    except ModuleNotFoundError as error:
-        raise missing(error, name) from None
+    except Exception as error:  # of code that may not be ours
+        lacking = missing(error, name) if isinstance(error, ModuleNotFoundError) else error
+        if isinstance(lacking, InputError | MissingLibraryError):
+            raise lacking from None
+        broken = f"cannot be loaded from {point.value}: {said(error)}"
+        raise InputError(point.group, repr(name), broken, "Mend or uninstall its package.") from error
 
 
 def _unknown(group: str, name: object) -> InputError:

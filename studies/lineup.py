@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,8 @@ from coopoc import InputError, Study
 from coopoc.arrays import Floats, one_of, refuse
 from coopoc.errors import unknown
 from coopoc.paths import given_path
-from coopoc.plugins import called, find, in_file, names
+from coopoc.plugins import called, find, holders, in_file, names
+from coopoc.study.provenance import code_of
 from coopoc.study.study import Params, Row
 from coopoc.study.style import NOT_CAUSAL_SUFFIX
 from coopoc.world.sensing import find_links
@@ -69,14 +71,21 @@ def key(p: Params) -> dict[str, str]:
     if weights.is_trained(p["method"]):
         digests["weights"] = weights.key(p["method"], p)
     elif p["method"] != "bound":
-        find("coopoc.methods", p["method"])
+        digests["method"] = _code("coopoc.methods", p["method"])
         if not in_file(p["method"]):
             one_of("noise model", p.get("noise_model", "nominal"), NOISE_MODELS)
     if p.get("metric"):
-        find("coopoc.metrics", p["metric"])
+        digests["metric"] = _code("coopoc.metrics", p["metric"])
     if p.get("noise_model") == "fitted":
         digests["clients"] = weights.drives(p["clients"]).digest
     return digests
+
+
+@lru_cache
+def _code(group: str, name: str) -> str:
+    """Hash of the code of a plugin; "" of one of coopoc, which counts in `scene.facts`."""
+    plugin, point = find(group, name), holders(group).get(name)
+    return "" if point and point.value.startswith("coopoc.") else code_of(plugin)
 
 
 def noise_model(p: Params) -> "NoiseModel | str":

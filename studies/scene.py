@@ -261,10 +261,10 @@ def facts(p: Params) -> Mapping[str, str]:
     Raises:
         InputError: parameters that no cell can be computed with.
     """
-    sensors(p), attacking(p), channel(p), start(p), egos(p)
+    sensors(p), attacking(p), start(p), egos(p)
     runs_in_memory(p.get("runs", 1), 8 * fleet(p["data"]).present.size)
     seed_of(p.get("seed", 0))
-    return {"code": revision(*CODE), **_digests(p["data"])}
+    return {"code": revision(*CODE), "channel": repr(channel(p)), **_digests(p["data"])}
 
 
 @lru_cache(maxsize=4)

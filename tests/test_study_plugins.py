@@ -1,5 +1,6 @@
 """Entry points: names, mappings, clashes, and distributions that are broken."""
 
+import string
 from importlib import metadata
 
 import pytest
@@ -7,6 +8,8 @@ from conftest import refused
 from shell import python
 
 from coopoc import plugins
+from coopoc.studies import lineup
+from coopoc.study.study import find_study
 
 
 def install(folder, name, points):
@@ -57,16 +60,18 @@ def test_distributions_are_read_once(site, monkeypatch):
 def test_what_cannot_be_loaded_hides_nothing_else(site):
     install(site, "broken", "[some.group]\nbroken = no_such_module:THING\nfine = math:pi\n")
     assert plugins.names("some.group") == ("broken", "fine")
-    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+    with refused("'broken': cannot be loaded from no_such_module:THING: No module named 'no_such_module'"):
         plugins.find("some.group", "broken")
     with refused("must be one of broken, fine"):
         plugins.find("some.group", "other")
 
 
-def test_two_distributions_may_not_claim_one_name(site):
+@pytest.mark.parametrize("other", ["x = math:tau", "table = string:TABLE"])
+def test_two_distributions_may_not_claim_one_name(site, monkeypatch, other):
+    monkeypatch.setattr(string, "TABLE", {"x": 1}, raising=False)
     install(site, "first", "[some.group]\nx = math:pi\n")
-    install(site, "second", "[some.group]\nx = math:tau\n")
-    with refused(r"'x': is claimed by math:\w+ and math:\w+\. Uninstall one"):
+    install(site, "second", f"[some.group]\n{other}\n")
+    with refused(r"'x': is claimed by \S+ and \S+\. Uninstall one"):
         plugins.find("some.group", "x")
 
 
@@ -79,3 +84,13 @@ def test_entry_points_are_pythons_own_after_the_backport_was_imported():
     )
     pytest.importorskip("importlib_metadata")
     assert "coopoc solve" in python("-c", code)
+
+
+def test_the_code_of_a_plugin_names_cells(site):
+    install(site, "one", "[coopoc.methods]\nmine = own_method:Own\n")
+    study, names = find_study("side_by_side").override({"method": "mine"}), []
+    for gain in (1, 2):
+        (site / "own_method.py").write_text(f"class Own:\n    gain = {gain}\n")
+        lineup._code.cache_clear()
+        names.append(study.cells()[0].name)
+    assert names[0] != names[1]
