@@ -3,9 +3,9 @@
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 from urllib.parse import unquote
 
 import numpy as np
@@ -17,6 +17,7 @@ from coopoc.plugins import in_file, names
 
 from .fetch import bring, local
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 STEP_ROUNDING = 1e-9
 """Share of a step by which a time may miss one."""
 
@@ -66,6 +67,19 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
                 f"Write {key}={example}; of a name a comma as %2C, a colon as %3A, & as %26.",
             ) from None
     return name, options
+
+
+def while_unchanged(made: Function) -> Function:
+    """lru_cache for a function whose first argument names data, until its files change."""
+    stored = lru_cache(3)(lambda files, *given: made(*given))
+
+    def current(data: str, *given: Any) -> Any:
+        name = split(data)[0]
+        paths = Path(name.rpartition(":")[0]), Path(name), *Path(name).rglob("*")
+        files = [(path.absolute(), path.stat().st_ctime_ns) for path in paths if path.is_file()]
+        return stored(str(files), data, *given)
+
+    return cast("Function", current)
 
 
 def there(name: str) -> None:

@@ -17,7 +17,7 @@ from coopoc.data.log.read import Log
 from coopoc.data.log.residuals import GATE_STDS, begin_of, together
 from coopoc.data.mrclam import calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, read_log
-from coopoc.data.source import split
+from coopoc.data.source import split, while_unchanged
 from coopoc.study.study import Params
 from coopoc.world.storage import digest
 
@@ -83,7 +83,7 @@ class Source(NamedTuple):
     text: Callable[[], str]
 
 
-@lru_cache(maxsize=2)
+@while_unchanged
 def source(data: str) -> Source:
     """The measurements of a folder of MR.CLAM, whose first part calibrates its sensors, or of a log in body frames,
     which states them.

@@ -1,7 +1,7 @@
 """Real vehicles with nothing simulated: when does a neighbour replace a landmark, such as a road-side unit?"""
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from coopoc import V2X, PoseFilter, Sensors, Study, heading_error, pose_nees
 from coopoc.arrays import Floats, number, one_of
 from coopoc.data.log.residuals import GATE_STDS
-from coopoc.data.source import split
+from coopoc.data.source import split, while_unchanged
 from coopoc.evaluate.metrics import errors, fix_innovations
 from coopoc.evaluate.scores import online_columns
 from coopoc.study.numbers import Results, Where, across, difference, interval, mean, present, ran
@@ -37,7 +37,7 @@ TRAINING_LANDMARKS, UNTIL_THINNED = (1, 4, 15), 30.0
 """Landmarks of the drives that noise is learned on, and s until they are thinned, a tenth of that part at most."""
 
 
-@lru_cache(maxsize=1)
+@while_unchanged
 def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[Any], float]]:
     """Noise learned on the part that calibrates, by way, one for all or one for each vehicle, and bytes that a vehicle
     sends for it: federated its constants once and as many for the answer, centralised 4 B for each number that it

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from coopoc import V2X, Fleet, InputError, Outliers, Recording, Sensors, observe
 from coopoc.arrays import Bools, one_of, runs_in_memory, seed_of
-from coopoc.data.source import split, there
+from coopoc.data.source import split, there, while_unchanged
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
 from coopoc.world.channels import channel as channel_of
@@ -31,7 +30,7 @@ TOWN = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axi
 """Settings that studies share: draws; training; filters without neighbours; draws of scenario 2 with neighbours."""
 
 
-@lru_cache(maxsize=4)
+@while_unchanged
 def fleet(data: str) -> Fleet:
     """The fleet of a bundled name or a path: of a log its truth, NaN where it is unknown."""
     log = _log(data)
@@ -46,7 +45,7 @@ def fleet(data: str) -> Fleet:
     )
 
 
-@lru_cache(maxsize=2)
+@while_unchanged
 def _log(data: str) -> "Log | None":
     """The log of a name or a path that holds one; None for anything else.
 
@@ -70,7 +69,7 @@ def is_real(data: str) -> bool:
     return _log(data) is not None
 
 
-@lru_cache(maxsize=4)
+@while_unchanged
 def measured(data: str) -> Recording | None:
     """One run of real data with all that its vehicles measured of each other; None where that is simulated."""
     everyone = V2X(len(fleet(data).ids), radius=float("inf"))
@@ -267,7 +266,7 @@ def facts(p: Params) -> Mapping[str, str]:
     return {"code": revision(*CODE), "channel": repr(channel(p)), **_digests(p["data"])}
 
 
-@lru_cache(maxsize=4)
+@while_unchanged
 def _digests(data: str) -> Mapping[str, str]:
     log = _log(data)
     measurements = {} if log is None else {"recording": digest(log.recording)}
@@ -301,7 +300,7 @@ def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
     return recording(p), egos(p), fleet(p["data"])
 
 
-@lru_cache(maxsize=2)
+@while_unchanged
 def _recording(
     data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None, remove_outliers: bool
 ) -> Recording:

@@ -5,14 +5,15 @@ import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from coopoc import V2X, InputError, Sensors, observe
 from coopoc.arrays import number
+from coopoc.data.source import while_unchanged
 from coopoc.errors import unknown
-from coopoc.plugins import file_digest, find, from_file, in_file
+from coopoc.plugins import find, from_file, in_file
 from coopoc.study.study import Params
 from coopoc.world.sensors import VelocityReading
 
@@ -54,7 +55,7 @@ def key(name: str, p: Params) -> str:
     return hashlib.sha256("".join(_job(name, p, seed)[1] for seed in seeds(p)).encode()).hexdigest()
 
 
-@lru_cache(maxsize=4)
+@while_unchanged
 def drives(clients: str) -> "Drives":
     """What nets are trained on: a fleet, whose measurements are simulated, or of real data its own measurements."""
     if not is_real(clients):
@@ -74,18 +75,11 @@ def _job(name: str, p: Params, seed: int) -> tuple[str, str]:
     """Label and key of the checkpoint of a method for one training seed."""
     if not is_trained(name) or not trainable({**p, "method": name}):
         raise unknown("trained method", name, LEARNED)
-    digest = file_digest(name) if in_file(name) else ""
-    jobs = _jobs(_recipe(name), digest, p["clients"], seed, start(p), p["velocity_reading"])
-    return jobs[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
-
-
-@lru_cache
-def _jobs(recipe: str, digest: str, clients: str, *setting: Any) -> list[tuple[str, str]]:
-    """Labels and keys of the checkpoints of a recipe; `digest` is that of its file."""
     from coopoc.learned.recipes import Setting, jobs_of
 
-    data = drives(clients)
-    return [(job.label, job.key(data)) for job in jobs_of(recipe, Setting(*setting), data)]
+    data, setting = drives(p["clients"]), Setting(seed, start(p), p["velocity_reading"])
+    job = jobs_of(_recipe(name), setting, data)[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
+    return job.label, job.key(data)
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
@@ -133,7 +127,7 @@ def checkpoint(name: str, p: Params, seed: int) -> "Checkpoint":
     return _checkpoint(Path(p["weights"]) / f"{label}.safetensors", key, net if in_file(net) else "")
 
 
-@lru_cache
+@while_unchanged
 def fitted(clients: str, reading: VelocityReading) -> "NoiseModel":
     """Noise fitted on the recording that the nets of training seed 0 saw, or on the measurements of real data."""
     from coopoc import NoiseModel

@@ -50,6 +50,12 @@ def test_the_clients_are_drawn_where_they_drive():
     assert panel.get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
 
 
+def test_data_that_changed_are_read_again(tmp_path):
+    for steps in (3, 4):
+        (tmp_path / "mine.py").write_text(f"import coopoc as co\nown = co.load_fleet('town10').between(0, {steps})\n")
+        assert len(scene.fleet(f"{tmp_path}/mine.py:own").t) == steps
+
+
 def test_neighbours_runs_without_any_training(tmp_path):
     """Only what is asked for is made: no weights for classical methods, and views of what was run."""
     results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path)
