@@ -91,6 +91,14 @@ def test_a_fitted_noise_model_finds_the_acting_noise(formation):
     assert fitted.process_std == pytest.approx((0.1, 0.1, 0.1), rel=0.02)
     late = replace(training, gnss=training.gnss + np.array([2.0, 0.0, 0.0]))  # an error that lasts is no less an error
     assert NoiseModel.fitted(late, formation).gnss_std[0] == pytest.approx(np.hypot(1.0, 2.0), rel=0.01)
+    factor = np.random.default_rng(0).uniform(0.5, 9.0, training.present.shape)
+    gnss = formation.position + factor[..., None] * (training.gnss - formation.position)
+    log = replace(training, gnss=gnss, fix_factor=factor, notes=(NOTHING_SIMULATED,))
+    log = replace(log, sensors=replace(log.sensors, velocity_floor=9.0))
+    stds = NoiseModel._constant(log, formation)
+    assert (*stds.gnss_std, *stds.process_std) == pytest.approx((*fitted.gnss_std, *fitted.process_std))
+    with refused("fleet = without truth"):
+        NoiseModel.fitted(replace(training, gnss=np.full_like(gnss, np.nan)), formation)
 
 
 @pytest.mark.parametrize(

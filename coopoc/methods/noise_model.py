@@ -101,9 +101,10 @@ class NoiseModel:
     def fitted(cls, recording: Recording, fleet: Fleet) -> "NoiseModel":
         """Per-axis standard deviations of a training recording against its truth.
 
-        process: rms of x_t - x_{t-1} - dt u_t, at least dt times the velocity floor; GNSS: rms of z_t - x_t. Relative
-        measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them; so do
-        fixes on an axis without any error, as the height of a drive in one plane is.
+        process: rms of x_t - x_{t-1} - dt u_t, of simulated drives at least dt times the velocity floor; GNSS: rms of
+        z_t - x_t over the factor that a log states of the fix. Relative measurements keep the data sheet's figures: the
+        training vehicles drive alone and cannot estimate them; so does an axis without any error, as the height of a
+        drive in one plane.
 
         Errors of real measurements last, which white noise cannot describe. So the last third of a log is held out,
         and `nominal` is returned, unless a Kalman filter fitted to the rest is better there by the 95 % interval over
@@ -112,6 +113,9 @@ class NoiseModel:
         Args:
             recording: of the training vehicles.
             fleet: their true motion.
+
+        Raises:
+            InputError: no truth where anything was measured.
         """
         recording = instance("recording", recording, Recording)
         same_drive(instance("fleet", fleet, Fleet), recording.ids, recording.t)
@@ -129,9 +133,13 @@ class NoiseModel:
     @classmethod
     def _constant(cls, recording: Recording, fleet: Fleet) -> "NoiseModel":
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
+        off = (recording.gnss - fleet.position) / recording.fix_scale
+        if not (np.isfinite(moved).any() and np.isfinite(off).any()):
+            actual, hint = "without truth of any fix, or of any motion", "Give the fleet whose drive was measured."
+            raise InputError("fleet", actual, "must be known where it was measured", hint)
+        process, gnss = (np.sqrt(np.nanmean(error**2, axis=(0, 1, 2))) for error in (moved, off))
         floor = recording.dt * recording.sensors.velocity_floor
-        process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)
-        gnss = np.sqrt(np.nanmean((recording.gnss - fleet.position) ** 2, axis=(0, 1, 2)))
+        process = np.where((process > 0) & recording.measured, process, np.maximum(process, floor))
         gnss = np.where(gnss > 0, gnss, recording.sensors.gnss_std)
         return cls("fitted", recording.sensors, tuple(process.tolist()), tuple(gnss.tolist()))
 
