@@ -116,7 +116,8 @@ class LearnedGain(Alone):
         estimates = np.hstack([x0[:, None], moved + origin])
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
-        return solo_track(recording, columns, estimates, None, began)
+        unused = ("the net does not use the standard deviations that fixes state",) * bool(recording.fix_factor.size)
+        return solo_track(recording, columns, estimates, None, began, unused)
 
 
 def _lanes(array: Floats) -> Tensor:

@@ -132,7 +132,7 @@ def errors_beside_fitted_filter(model: Gain, data: Sequence[Client]) -> tuple[fl
     motions = training.truth.diff(dim=1) - training.dt * training.velocity[:, 1:]
     process, gnss = (
         off.square().nanmean((0, 1)).sqrt().nan_to_num(1.0).clip(LEAST_STD)
-        for off in (motions, training.gnss - training.truth)
+        for off in (motions, (training.gnss - training.truth) / (1.0 if training.scale is None else training.scale))
     )
     fitted = NoiseParameters().with_logs(torch.stack([process, torch.full((3,), LEAST_STD), gnss]).log())
     ours, theirs = (sqrt(Judge([[validation]], net)(flatten([net]))) for net in (model, fitted))

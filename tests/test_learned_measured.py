@@ -45,6 +45,7 @@ def batch(seed=0, steps=30, lanes=4):
 def test_pieces_are_what_was_measured_from_a_fix_on():
     """Ten fixes at every seventh step are 70 steps; the next piece begins at the first fix after that."""
     recording, fleet = walk(1700, every=7)
+    recording = replace(recording, fix_factor=default_rng(1).uniform(0.5, 9.0, (1700, 2)))
     first = measured_clients(MeasuredDrives(recording, fleet), piece=10)[0]
     pieces = Segments.join([first.training, first.validation])
     for row, at in enumerate(range(0, 22 * 77, 77)):
@@ -52,6 +53,7 @@ def test_pieces_are_what_was_measured_from_a_fix_on():
         for ours, theirs in ((pieces.gnss, recording.gnss[0]), (pieces.truth, fleet.position)):
             assert_allclose(ours[row], theirs[at : at + 71, 0] - origin, atol=1e-5, equal_nan=True)
         assert_allclose(pieces.velocity[row], recording.velocity[0, at : at + 71, 0], atol=1e-6)
+        assert_allclose(pieces.scale[row, :, 0], recording.fix_factor[at : at + 71, 0], rtol=1e-6)
     assert (len(first.training), len(first.validation)) == (17, 5)
     assert first.long.truth.shape[1] == 9 * 70 + 1
 

@@ -43,16 +43,20 @@ def test_recovers_the_share_of_the_velocity():
 
 
 def test_equals_filterpy():
-    """Where fixes are missing, too; so do the estimates and innovations that are trained."""
+    """Where fixes are missing or state their deviations, too; so do the estimates and innovations that are trained."""
     method = OptimisedKF((0.1, 0.2, 0.05), (0.1, 0.05, 0.0), (1.5, 2.0, 0.7))
     velocity = np.random.default_rng(0).normal(0, 8, (50, 1, 3))
     rec = holed(observe(Fleet(("a",), np.arange(50) / 10, np.cumsum(0.1 * velocity, 0), velocity), Sensors()), 0.5)
     rec = replace(rec, velocity=rec.velocity[:, [0, 0, *range(2, 50)]])  # the pace of a piece begins at its first step
-    track = method(rec)
+    factor = np.random.default_rng(1).uniform(0.5, 9.0, (50, 1))
+    rec = replace(rec, fix_factor=factor)
+    track, r = method(rec), np.diag(np.square(method.gnss_std))
     given = (torch.tensor(a[0, 1:, None]) for a in (rec.gnss, rec.velocity, rec.gnss))
     stds = torch.tensor([[method.process_std, method.velocity_ratio, method.gnss_std]], dtype=torch.float64)
-    ours, normalised = scan(stds, Batch(*given, torch.tensor(rec.gnss[:, :1, 0]), 0.1))
-    theirs = filterpys(rec.gnss[0, 0, 0], np.diag(np.square(method.gnss_std)), 0.1)
+    ours, normalised = scan(
+        stds, Batch(*given, torch.tensor(rec.gnss[:, :1, 0]), 0.1, False, torch.tensor(factor[:, None, None]))
+    )
+    theirs = filterpys(rec.gnss[0, 0, 0], factor[0] ** 2 * r, 0.1)
     before, square = rec.velocity[0, 0, 0], rec.velocity[0, 0, 0] ** 2
     for step in range(1, 50):
         u = rec.velocity[0, step, 0]
@@ -60,7 +64,7 @@ def test_equals_filterpy():
         moved = 0.1 * np.array(method.velocity_ratio) * np.sqrt(square)
         theirs.predict(u=u, Q=np.diag(np.square(method.process_std) + moved**2))
         fix = rec.gnss[0, step, 0]
-        theirs.update(None if np.isnan(fix[0]) else fix)
+        theirs.update(None if np.isnan(fix[0]) else fix, factor[step] ** 2 * r)
         assert_allclose(track.x[0, step, 0], theirs.x, atol=1e-10)
         assert_allclose(track.covariance[0, step, 0], theirs.P, atol=1e-10)
         assert_allclose(ours[step - 1, 0, 0], theirs.x, atol=1e-9)
@@ -85,6 +89,14 @@ def test_padding_does_not_weigh():
     net = NoiseParameters()
     alone = [float(Judge([[part]], net)(flatten([net]))) for part in (few, many)]
     assert_allclose(Judge([[few, many]], net)(flatten([net, net])), alone, rtol=1e-6)
+
+
+def test_pieces_without_a_fix_do_not_lower_the_scale():
+    (client,) = clients(walk(900, 1)[1], Sensors(), piece=20)
+    seen, net = client.training, NoiseParameters()
+    blind = replace(seen, gnss=seen.gnss.clone().index_fill(1, torch.arange(1, 21), torch.nan))
+    ours, theirs = (net.calibrate(parts).logs.detach() for parts in ([seen, blind], [seen]))
+    assert_allclose(ours, theirs, atol=1e-5)
 
 
 def test_noise_that_cannot_be_is_refused():

@@ -1,5 +1,7 @@
 """Solo filters against textbook oracles, with gaps and absences; noise of fixes that need not be known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import holed, refused, winding, without
@@ -10,6 +12,7 @@ from coopoc import GNSS, V2X, CooperativeFilter, Kalman, NoiseModel, Sensors, ob
 from coopoc.evaluate.metrics import nees, rt_le
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter
+from coopoc.methods.noise_model import motion_noise
 
 S2 = Sensors.paper_scenario2()
 
@@ -56,6 +59,14 @@ def test_kalman(crossing, noise, known):
         mean, variance = oracle.kalman(*series(seen, q, r, run, n, c), None if start is None else start[n, c])
         assert_allclose(x[run, :, n, c], mean, rtol=1e-12, atol=1e-12)
         assert_allclose(p[run, :, n, c], variance, rtol=1e-10)
+
+
+def test_noise_that_a_recording_states_is_every_filters(crossing):
+    seen, model = gaps(crossing), NoiseModel.nominal(S2)
+    more = np.random.default_rng(0).uniform(0.5, 9.0, seen.present.shape)
+    seen, fixes = replace(seen, fix_factor=more, motion_variance=more), FixNoise(model.gnss_variance)
+    named, plain = (solo_filter(seen, [0, 2], noise, fixes) for noise in (model, motion_noise(model, seen.dt)))
+    assert_array_equal(named[:2], plain[:2])
 
 
 def test_gnss_holds_the_last_fix(crossing):

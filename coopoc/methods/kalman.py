@@ -213,9 +213,9 @@ def solo_filter(
     columns = np.asarray(columns)
     shape = *gnss.shape[:2], len(columns), 3
     first = int(x0 is not None)
-    scale: Floats = np.ones((1, 1, 1))
     if isinstance(noise, MotionNoise):
-        process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
+        process, scale = own_variances(noise, velocity[:, :, columns], recording.dt, first), recording.fix_scale
+        process = process + recording.motion_extra[:, columns]
     else:
         process, scale = noise.process_variance(recording, columns, first=first), noise.fix_scale(recording)
     variance = np.broadcast_to(scale**2 * fixes.variance, gnss.shape[1:])[:, columns]

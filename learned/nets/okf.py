@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from coopoc.world.recording import Vehicles, check_recording
 
 from ..training.clients import Batch, Segments
 from ..training.schedule import one_core
-from .gain import Gain, flatten, over_time, squared_error
+from .gain import Gain, flatten, squared_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +130,11 @@ class NoiseParameters(Gain):
     def calibrate(self, parts: Sequence[Segments]) -> "NoiseParameters":
         """The same filter with the scale that gives the normalised innovations of all training segments unit variance.
 
-        Of each client's segments it needs the mean square per axis only: three numbers per client.
+        Of each client's segments it needs the sum of squares per axis and the number of fixes: four numbers per client.
         """
-        squares, pieces = torch.zeros(3), sum(map(len, parts))
-        for segments in parts:
-            innovation = scan(self.stds(flatten([self])), segments.batch(torch.arange(len(segments))[None]))[1]
-            squares += over_time(innovation.square(), innovation.isfinite()).sum((0, 1))
-        return self.with_logs(self.logs + log_scale(squares / pieces))
+        every = Segments.join(parts)
+        innovations = scan(self.stds(flatten([self])), every.batch(torch.arange(len(every))[None]))[1]
+        return self.with_logs(self.logs + log_scale(innovations.square().nanmean((0, 1, 2))))
 
 
 def log_scale(squares: Tensor) -> Tensor:
@@ -156,11 +155,12 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     missing the filter predicts, and the innovation is NaN."""
     process, ratio, gnss_std = stds.unsqueeze(2).unbind(1)
     noise, x = gnss_std.square(), batch.x0
-    variance = noise * (not batch.exact)
+    noises = repeat(noise) if batch.scale is None else iter(noise * batch.scale.square())
+    variance = next(noises) * (not batch.exact)
     estimates, normalised = [], []
     paces = own_variances(OF_PACE, batch.velocity.transpose(0, 1).double().numpy(), batch.dt)
     motions = process.square() + ratio.square() * torch.from_numpy(paces).transpose(0, 1).to(ratio)
-    for fix, speed, motion in zip(batch.gnss.unbind(), batch.velocity.unbind(), motions.unbind(), strict=True):
+    for fix, speed, motion, noise in zip(batch.gnss, batch.velocity, motions, noises, strict=False):
         variance = variance + motion
         there = fix.isfinite()
         gain = torch.where(there, variance / (variance + noise), 0.0)

@@ -21,7 +21,8 @@ LONG_PIECES = 9
 
 class Batch(NamedTuple):
     """Input of S models, B segments each: gnss, NaN where a fix is missing, velocity, truth, NaN where there is none
-    and no loss counts (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is the truth."""
+    and no loss counts (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is the truth; factors (T + 1, S, B, 1) of the
+    deviations of fixes from that of x0 on, None where all are 1."""
 
     gnss: Tensor
     velocity: Tensor
@@ -29,6 +30,7 @@ class Batch(NamedTuple):
     x0: Tensor
     dt: float
     exact: bool = False
+    scale: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class Segments:
         truth: (n, T + 1, 3) m.
         true_start: whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
         dt: s.
+        scale: (n, T + 1, 1) factors of the deviations of fixes, as `Recording.fix_scale`; None: all are 1.
     """
 
     gnss: Tensor
@@ -48,6 +51,7 @@ class Segments:
     truth: Tensor
     true_start: bool
     dt: float
+    scale: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -67,7 +71,8 @@ class Segments:
         """Segments `index` (S, B)."""
         drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
         gnss, velocity, truth = drives[:, 1:].unbind()
-        return Batch(gnss, velocity, truth, drives[2 * self.true_start, 0], self.dt, self.true_start)
+        scale = None if self.scale is None else self.scale[index].movedim(2, 0)
+        return Batch(gnss, velocity, truth, drives[2 * self.true_start, 0], self.dt, self.true_start, scale)
 
     @cached_property
     def _drives(self) -> AnyArray:
@@ -112,7 +117,7 @@ def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
         return torch.where(swap, vectors.index_select(-1, torch.tensor([1, 0, 2])), vectors) * signs
 
     gnss, velocity, truth = turn(torch.stack([batch.gnss, batch.velocity, batch.truth])).unbind()
-    return Batch(gnss, velocity, truth, turn(batch.x0), batch.dt, batch.exact)
+    return batch._replace(gnss=gnss, velocity=velocity, truth=truth, x0=turn(batch.x0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -211,4 +211,5 @@ def _segments(drives: MeasuredDrives, column: int, cuts: Sequence[Cut], piece: i
         truth=tensor(target, origin),
         true_start=start == "true",
         dt=recording.dt,
+        scale=tensor(recording.fix_scale[None]) if recording.fix_factor.size else None,
     )

@@ -16,8 +16,8 @@ from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 from ..engine.backward import Moments, Update
-from ..nets.gain import Gain, flatten, over_time, unflatten
-from ..nets.okf import NoiseParameters, log_scale, scan
+from ..nets.gain import Gain, flatten, unflatten
+from ..nets.okf import NoiseParameters
 from .clients import Batch, Segments, mirrored
 from .schedule import Schedule, cosine, generator, one_core, watched
 
@@ -225,17 +225,16 @@ def fit_okf(
         _loss(like, logs, *data).backward()
         adam.step()
         fall.step()
-    with torch.no_grad():  # the factor per axis that gives the normalised innovations unit variance
-        normalised, share = scan(like.stds(best), data[0])[1], data[1][..., None]
-        factor = log_scale((over_time(normalised.square(), normalised.isfinite()) * share).sum(1))
-        made = like.with_logs(best.view(3, 3) + factor)
+    made = like.with_logs(best.view(3, 3)).calibrate([training])
     return made, {"validation_loss": tuple(history), "seconds": time.perf_counter() - began}
 
 
 def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
     """The same in float64."""
-    gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
-    return Batch(gnss, velocity, truth, x0, batch.dt, batch.exact), share.double()
+    doubled: dict[str, Any] = {
+        name: value.double() for name, value in batch._asdict().items() if isinstance(value, Tensor)
+    }
+    return batch._replace(**doubled), share.double()
 
 
 def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
