@@ -9,12 +9,12 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from coopoc.arrays import Floats, check_fields
+from coopoc.arrays import Bools, Floats, check_fields
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
-from coopoc.methods.kalman import solo_track, start_of
+from coopoc.methods.kalman import solo_track
 from coopoc.methods.motion_history import MotionHistory, three
-from coopoc.methods.track import Alone, Track, in_stretches
+from coopoc.methods.track import Alone, Track, in_stretches, start_of
 from coopoc.text import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
@@ -35,6 +35,7 @@ class GainStream:
     def __init__(self, model: Any, x0: ArrayLike | None, history: float) -> None:
         self.history, self._model = MotionHistory(history), model
         self._x: Floats = np.full(3, np.nan) if x0 is None else three("x0", x0)
+        self._start, self._moves = self._x, np.zeros(3, bool)
         self._memory = model.start(torch.zeros((1, 3), dtype=next(model.parameters()).dtype))
 
     @one_core()
@@ -48,7 +49,7 @@ class GainStream:
         self.history.push(dt, moved, np.zeros(3))
         fix, _ = self.history.forward(gnss, fix_age)
         if np.isnan(self._x).all():
-            self._x = fix
+            self._x = self._start = fix
             return fix.copy(), None
         near, motion = (torch.as_tensor(a[None], dtype=self._memory.x.dtype) for a in (fix - self._x, moved))
         with torch.inference_mode():
@@ -56,7 +57,8 @@ class GainStream:
             positions = [name for name in self._model.positions if name in memory._fields]
             self._memory = memory._replace(**{name: getattr(memory, name) - memory.x for name in positions})
         self._x = self._x + memory.x[0].numpy()
-        return self._x.copy(), None
+        self._moves |= moves(fix - self._start, moved)
+        return np.where(self._moves, self._x, self._start), None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +108,23 @@ class LearnedGain(Alone):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` say where fixes contradict them."""
-        began, columns = clock(), check_recording(recording).columns(egos)
+        began, columns = clock(), check_recording(recording).columns(egos, self.x0 is None)
         fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
-        origin, x0 = fixes[:, :1], start_of(self.x0, fixes[:, 0])
-        lanes = _lanes(fixes[:, 1:] - origin), _lanes(speeds[:, 1:]), _lanes(x0[:, None] - origin)[:, 0]
+        origin = start_of(self.x0, fixes[:, 0])[:, None]
+        off, speeds = fixes[:, 1:] - origin, speeds[:, 1:]
         with one_core(), torch.inference_mode():
-            moved = self.model(*lanes, recording.dt).numpy().astype(float)
+            moved = self.model(_lanes(off), _lanes(speeds), _lanes(0.0 * origin)[:, 0], recording.dt).numpy()
         moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, 3), 2, 1)
-        estimates = np.hstack([x0[:, None], moved + origin])
-        held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
-        estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
+        moved = np.where(np.logical_or.accumulate(moves(off, speeds), axis=1), moved, 0.0)
+        estimates = np.hstack([origin, origin + moved])
         unused = ("the net does not use the standard deviations that fixes state",) * bool(recording.fix_factor.size)
         return solo_track(recording, columns, estimates, None, began, unused)
+
+
+def moves(off: Floats, speeds: Floats) -> Bools:
+    """Where a fix is off the start, or the odometry moves. Until then the start is held: a net has no height for a
+    drive in one plane."""
+    return (abs(off) > 0.0) | (speeds != 0.0)
 
 
 def _lanes(array: Floats) -> Tensor:

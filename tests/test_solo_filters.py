@@ -61,6 +61,12 @@ def test_kalman(crossing, noise, known):
         assert_allclose(p[run, :, n, c], variance, rtol=1e-10)
 
 
+def test_known_starts_of_several_across_a_gap(crossing):
+    seen, x0 = gaps(crossing, (slice(20, 30), 1)), crossing.position[0]
+    both, alone = Kalman(x0=x0[[1, 3]])(seen, [1, 3]), Kalman(x0=x0[[3]])(seen, [3])
+    assert_array_equal(both.x[:, :, 1], alone.x[:, :, 0])
+
+
 def test_noise_that_a_recording_states_is_every_filters(crossing):
     seen, model = gaps(crossing), NoiseModel.nominal(S2)
     more = np.random.default_rng(0).uniform(0.5, 9.0, seen.present.shape)

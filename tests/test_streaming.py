@@ -50,9 +50,16 @@ def play(stream, recording, ego, run, first=0):
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("name", SOLO)
 def test_step_by_step_is_the_track(name, known, crossing):
-    """From the first fix, and from a known start, whose own step is no step of the stream; a third has no fix."""
+    """From the first fix, and from a known start, whose own step is no step of the stream and has no fix, nor have a
+    third; in one plane, at first or throughout."""
     method, start = SOLO[name]
     recording, x0 = holed(observe(crossing, S2, V2X(max_neighbours=0), runs=2)), crossing.position[0, 3]
+    gnss, velocity = recording.gnss.copy(), recording.velocity.copy()
+    flat = 9 if known else len(gnss[0])
+    gnss[:, :flat, :, 2] *= 0.0
+    velocity[:, :flat, :, 2] *= 0.0
+    gnss[:, : int(known)] = np.nan
+    recording = replace(recording, gnss=gnss, velocity=velocity)
     track = (replace(method, x0=x0[None]) if known else method)(recording, [3])
     x, cov = play(start(x0) if known else start(), recording, 3, run=1, first=int(known))
     assert_allclose(x, track.x[1, known:, 0], atol=1e-5 if name == "net" else 1e-12)

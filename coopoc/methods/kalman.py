@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Floats, last_true
-from ..errors import InputError
 from ..kernels.compiling.waiting import clock
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.gate import FIX_GATE
@@ -21,7 +20,7 @@ from .doubts import doubts
 from .motion_history import MotionHistory, three
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .odometry_fault import with_odometry
-from .track import Alone, Checked, Track, in_stretches
+from .track import Alone, Checked, Track, in_stretches, start_of
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Kalman(Alone, Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = clock()
-        columns = check_recording(recording).columns(egos)
+        columns = check_recording(recording).columns(egos, self.x0 is None)
         assumed = resolve(self.noise_model, recording, relative=False)
         if self.robust:
             recording, assumed = with_odometry(recording, columns, assumed)
@@ -170,17 +169,6 @@ def solo_track(
     notes = (*notes, *doubts(recording, columns, x, cov, noise_model, earlier=notes))
     x.flags.writeable = False
     return Track(recording.t, tuple(columns), x, cov, none, none, clock() - began, notes=notes, ids=recording.ids)
-
-
-def start_of(x0: Floats | None, fixes: Floats) -> Floats:
-    """A known start x0 (R, E, 3) or (E, 3) m, else the first fixes (R, E, 3) m; InputError for another shape or NaN."""
-    if x0 is None:
-        return fixes
-    actual = f"shape {np.shape(x0)}" if np.isfinite(x0).all() else "not finite"
-    if actual not in (f"shape {fixes.shape}", f"shape {fixes.shape[1:]}"):
-        allowed = f"must be finite, (R, E, 3) = {fixes.shape} or (E, 3)"
-        raise InputError("x0", actual, allowed, "Give one position per ego.")
-    return np.broadcast_to(x0, fixes.shape)
 
 
 def solo_filter(

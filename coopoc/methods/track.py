@@ -213,6 +213,17 @@ class Checked:
         check_fields(self)
 
 
+def start_of(x0: Floats | None, fixes: Floats) -> Floats:
+    """A known start x0 (R, E, 3) or (E, 3) m, else the first fixes (R, E, 3) m; InputError for another shape or NaN."""
+    if x0 is None:
+        return fixes
+    actual = f"shape {np.shape(x0)}" if np.isfinite(x0).all() else "not finite"
+    if actual not in (f"shape {fixes.shape}", f"shape {fixes.shape[1:]}"):
+        allowed = f"must be finite, (R, E, 3) = {fixes.shape} or (E, 3)"
+        raise InputError("x0", actual, allowed, "Give one position per ego.")
+    return np.broadcast_to(x0, fixes.shape)
+
+
 def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
     """A method's `__call__` that begins anew after each gap of an ego; its estimate is NaN where there is none.
 
@@ -231,19 +242,19 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
     def across(self: Any, recording: Recording, egos: Vehicles = (0,)) -> Track:
         columns = check_recording(recording).observing(egos)
         whole = (0, len(recording.t))
-        cuts = {column: recording.stretches(column, fixed=needs_fix(self)) for column in columns}
+        known = (x0 := getattr(self, "x0", None)) is not None
+        cuts = {column: recording.stretches(column, fixed=needs_fix(self), known=known) for column in columns}
         if all(pieces in ((), (whole,)) for pieces in cuts.values()):
             return noted(call(self, recording, egos))
         for column, pieces in cuts.items():
             if not pieces:
                 never = "is never present at two successive steps with a fix"
                 raise InputError("egos", repr(recording.ids[column]), never, "Choose another ego.")
-        later = self if getattr(self, "x0", None) is None else replace(self, x0=None)
-        parts = {
-            (column, cut): call(later if cut[0] > 0 else self, recording.between(*cut), [recording.ids[column]])
-            for column in columns
-            for cut in cuts[column]
-        }
+        parts, starts = {}, start_of(x0, recording.gnss[:, 0, columns])
+        for k, column in enumerate(columns):
+            for cut in cuts[column]:
+                own = replace(self, x0=None if cut[0] else starts[:, [k]]) if known else self
+                parts[column, cut] = call(own, recording.between(*cut), [recording.ids[column]])
         return noted(_joined(recording, columns, parts))
 
     return across

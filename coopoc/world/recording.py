@@ -239,7 +239,9 @@ class Recording:
             motion_variance=self.motion_variance[part],
         )
 
-    def stretches(self, vehicle: int | str, shortest: int = 2, fixed: bool = True) -> tuple[tuple[int, int], ...]:
+    def stretches(
+        self, vehicle: int | str, shortest: int = 2, fixed: bool = True, known: bool = False
+    ) -> tuple[tuple[int, int], ...]:
         """(start, stop) of the steps at which a vehicle is there without a break, each from a fix in all runs
         on, or else from the first step.
 
@@ -249,6 +251,7 @@ class Recording:
             vehicle: index or id.
             shortest: number of steps.
             fixed: whether each begins with a fix.
+            known: whether the position at step 0 is, so that the first needs no fix there.
 
         >>> from coopoc import Fleet, Sensors, observe
         >>> fleet = Fleet(("a",), [0, 0.1, 0.2], np.zeros((3, 1, 3)), np.zeros((3, 1, 3)))
@@ -258,6 +261,7 @@ class Recording:
         (col,) = columns("vehicle", [vehicle], self.ids)
         least, every = number("shortest", shortest, kind=int), not instance("fixed", fixed, bool)
         has_fix = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | every
+        has_fix[: instance("known", known, bool)] = True
         there = self.present[:, col]
         firsts = [(a + int(np.argmax(has_fix[a:b])), b) for a, b in stretches(there) if has_fix[a:b].any()]
         return tuple((a, b) for a, b in firsts if b - a >= least)

@@ -73,7 +73,7 @@ class OptimisedKF(Alone):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates and covariances of the egos."""
-        began, columns = clock(), check_recording(recording).columns(egos)
+        began, columns = clock(), check_recording(recording).columns(egos, self.x0 is None)
         fixes = FixNoise(np.square(self.gnss_std))
         x, variance, _ = solo_filter(recording, columns, self._motion(0.0), fixes, self.x0)
         return solo_track(recording, columns, x, variance, began)
