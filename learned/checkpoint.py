@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import safetensors
 from safetensors.torch import save as to_bytes
 from torch import Tensor
@@ -21,6 +20,7 @@ from coopoc.paths import given_path
 from coopoc.plugins import find, in_file, path_of, points
 from coopoc.text import short_repr
 
+from .federation.history import selected
 from .nets.gain import Gain, unflatten
 
 _HISTORY, CHECKSUM = "history", "checksum"
@@ -50,14 +50,8 @@ class Checkpoint:
         return unflatten(rows[number("row", row, 0, len(rows) - 1, kind=int, allowed=allowed, hint=hint)], self.model)
 
     def kept(self, row: int) -> int:
-        """Row up to `row` whose weights validated best: those kept by a training that ended there.
-
-        The loss of a federation is the mean over its clients, weighted by their training pieces.
-        """
-        losses = [np.asarray(r["validation_loss"], float) for r in self.card["history"][: row + 1]]
-        weights = np.asarray(self.card["training_pieces"], float)
-        means = [float(np.average(loss, weights=weights)) if loss.ndim else float(loss) for loss in losses]
-        return int(np.argmin(np.where(np.isfinite(means), means, np.inf)))
+        """Row up to `row` whose weights are kept by a training that ended there (`federation.history.selected`)."""
+        return selected(self.card["history"][: row + 1], self.card["training_pieces"], self.card["clients"])
 
 
 def save(path: Path | str, checkpoint: Checkpoint) -> Path:

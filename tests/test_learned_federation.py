@@ -16,6 +16,7 @@ from torch import nn
 
 from coopoc import Sensors
 from coopoc.learned import GainNet, Schedule, clients, federate
+from coopoc.learned.checkpoint import Checkpoint
 from coopoc.learned.federation.federate import Participation
 from coopoc.learned.federation.history import Federation, Round, ledger
 from coopoc.learned.federation.rules import (
@@ -127,8 +128,11 @@ def test_a_client_that_never_answered_does_not_choose_the_weights(four):
     def without_fixes(pieces):
         return replace(pieces, gnss=torch.full_like(pieces.gnss, torch.nan))
 
-    broken = replace(four[0], training=without_fixes(four[0].training), validation=without_fixes(four[0].validation))
-    fed = trained([broken, *four[1:]], 3)
+    blind = replace(four[0], validation=without_fixes(four[0].validation))
+    fed = trained([blind, *four[1:]], 3)
+    assert fed.history[1].rejected == {"a": "a validation-loss of inf m^2, must be in [-1e+12, 1e+12]"}
+    assert fed.best.number > 0
+    fed = trained([replace(blind, training=without_fixes(four[0].training)), *four[1:]], 3)
     assert fed.history[1].rejected == {"a": "loss or gradient not finite at step 1"}
     assert fed.best.number == trained(four[1:], 3).best.number > 0
     assert "a" not in fed.history[1].sent
@@ -383,7 +387,9 @@ def test_one_client_cannot_select_the_untrained_round(false, clients):
     curve = np.linspace(4.0, 1.0, 8)[:, None] * np.linspace(0.8, 1.2, clients)
     assert federation(curve).best.number == 7
     curve[:, 0] = [1e-9, *[false] * 7]
-    assert federation(curve).best.number >= 6
+    fed = federation(curve)
+    card = fed.card | {"training_pieces": fed.sizes, "clients": fed.names}
+    assert fed.best.number == Checkpoint(fed.model, card).kept(7) >= 6
 
 
 def test_honest_reports_select_the_least_mean():

@@ -111,6 +111,7 @@ def test_the_rounds_are_those_of_federate(rule):
     for mine, theirs in zip(found.history[1:], expected.history[1:], strict=True):
         torch.testing.assert_close(mine.weights, theirs.weights, rtol=0, atol=1e-6)
         assert mine.validation_loss == pytest.approx(theirs.validation_loss, rel=1e-4)
+        assert mine.received_bytes == 2 * theirs.received_bytes  # to train, and to validate
         assert mine.training_loss == pytest.approx(theirs.training_loss, rel=1e-4)
     assert found.best.number == 1 + int(np.argmin([expected.validation_loss(row) for row in expected.history[1:]]))
 
@@ -155,7 +156,7 @@ def test_bad_answers_are_rejected_and_training_goes_on():
         10: lambda message: Message(Error(0, "out of\nmemory"), reply_to=message),
         11: sends("", theta),
         12: sends("a\nb", theta),
-        13: sends("loss", theta, training_loss=-1.0),
+        13: sends("loss", theta, training_loss=-1e13),
         14: sends("none", theta, num_examples=0),
         15: sends("old", theta, version="0"),
         16: sends("server", theta),
@@ -190,7 +191,7 @@ def test_bad_answers_are_rejected_and_training_goes_on():
             "other records than were asked for",
             "out of memory",
             "1 to 200 printable",
-            "a training-loss of -1 m^2, must be in [0, 1e+12]",
+            "a training-loss of -1e+13 m^2, must be in [-1e+12, 1e+12]",
             "number of pieces",
             "another version",
             "or the server's",

@@ -19,7 +19,7 @@ from ..training.clients import Client
 from ..training.fit import Judge, descend, pooled
 from ..training.schedule import COUNT_LIMITS, Schedule, cosine, generator, one_core, watched
 from .history import Federation, Round
-from .rules import FLOAT32, SERVER, Answer, Combine, Rule, Standing, combine, rule
+from .rules import FLOAT32, SERVER, Answer, Combine, Rule, Standing, combine, implausible, rule
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,11 @@ def federate(
         }
         standing, rejected, note = combine(plan.rule, standing, answers)
         rejected = {name: own.failure for name, own in trained.items() if own.failure} | rejected
-        reports = zip(names, validated(standing.theta), history[-1].validation_loss, strict=True)
+        reports = list(zip(names, validated(standing.theta), history[-1].validation_loss, strict=True))
+        losses = {
+            name: why for name, loss, _ in reports if name in asked and (why := implausible("validation-loss", loss))
+        }
+        rejected = losses | rejected
         size = FLOAT32 * len(standing.theta)
         row = Round(
             number,

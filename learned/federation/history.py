@@ -1,9 +1,9 @@
 """The record of a federated training: its rounds, the selected net, and the traffic."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import inf, isfinite
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from coopoc import Ledger
-from coopoc.arrays import instance, number
+from coopoc.arrays import Floats, instance, number
 from coopoc.evaluate.ledger import of_training
 from coopoc.text import short_repr
 
 from ..nets.gain import Gain, unflatten
-from .rules import SERVER
+from .rules import LARGEST_LOSS, SERVER
 
 AGREEMENT = 0.1
 """Excess of a round's median loss over the least one up to which the round may be selected."""
@@ -115,26 +115,15 @@ class Federation:
         that the other clients find poor. One or two reports have no majority: then all rounds compete. Without any
         client it is the start.
         """
-        if not self.sizes:
-            return self.history[0]
-        typical = [np.median([_or_infinite(loss) for _, loss in self._reports(row)]) for row in self.history]
-        most = min(typical) + AGREEMENT * abs(min(typical)) if len(self._reports(self.history[0])) > 2 else inf
-        agreed = [row for row, middle in zip(self.history, typical, strict=True) if middle <= most]
-        return min(agreed, key=self.validation_loss)
+        return self.history[selected([row.card for row in self.history], self.sizes, self.names)]
 
     def validation_loss(self, row: Round) -> float:
         """Mean of the clients' last reports, weighted by size, m^2; infinite if it is not finite.
 
         Clients of which no answer was ever accepted do not count.
         """
-        reports = self._reports(row)
-        return _or_infinite(sum(n * loss for n, loss in reports) / sum(n for n, _ in reports))
-
-    def _reports(self, row: Round) -> list[tuple[int, float]]:
-        """Sizes and losses, in a round, of the clients that count."""
-        out = [{*past.rejected, *past.absent} for past in self.history[1:]]
-        counted = [i for i, name in enumerate(self.names) if not out or any(name not in missing for missing in out)]
-        return [(self.sizes[i], row.validation_loss[i]) for i in counted or range(len(self.sizes))]
+        losses, sizes = reports([past.card for past in self.history], self.sizes, self.names)
+        return float(np.average(losses[self.history.index(row)], weights=sizes))
 
     def after(self, rounds: int) -> Gain:
         """The global net after so many rounds, 0 being the start."""
@@ -143,8 +132,26 @@ class Federation:
         return unflatten(self.history[rounds].weights, self.like)
 
 
-def _or_infinite(loss: float) -> float:
-    return loss if isfinite(loss) else inf
+def reports(
+    rows: Sequence[Mapping[str, Any]], sizes: Sequence[int], names: Sequence[str]
+) -> tuple[Floats, Sequence[int]]:
+    """Losses (rows, C), infinite if implausible, and sizes of the clients that count, of the rows of a card's history:
+    of those of which an answer was ever accepted, of all if there are none."""
+    missing = [{*row.get("rejected", ()), *row.get("absent", ())} for row in rows[1:]]
+    accepted = [i for i, name in enumerate(names) if any(name not in some for some in missing)] or range(len(sizes))
+    losses = np.array([np.broadcast_to(row["validation_loss"], len(sizes)) for row in rows], float)[:, accepted]
+    return np.where(abs(losses) <= LARGEST_LOSS, losses, inf), [sizes[i] for i in accepted]
+
+
+def selected(rows: Sequence[Mapping[str, Any]], sizes: Sequence[int], names: Sequence[str]) -> int:
+    """Row of a card's history whose weights are kept, as `Federation.best`; of a fit the one with the least loss."""
+    losses, counted = reports(rows, sizes, names)
+    if not counted:
+        return 0
+    typical = np.median(losses, axis=1)
+    most = min(typical) + AGREEMENT * abs(min(typical)) if len(counted) > 2 else inf
+    agreed = np.flatnonzero(typical <= most)
+    return int(agreed[np.average(losses[agreed], axis=1, weights=counted).argmin()])
 
 
 def ledger(federation: Federation, overhead: int = 0) -> Ledger:

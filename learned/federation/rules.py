@@ -212,6 +212,15 @@ FLOAT32 = 4
 LONGEST_UPDATE = 100.0
 """Longest accepted update, in multiples of the usual one."""
 
+LARGEST_LOSS = 1e12
+"""m^2, the largest plausible loss: an error of 1,000 km."""
+
+
+def implausible(name: str, loss: float) -> str:
+    """Why a client's loss of this name is rejected, "" if it is not; that of a likelihood may be negative."""
+    limits = f"must be in [-{LARGEST_LOSS:g}, {LARGEST_LOSS:g}]"
+    return "" if abs(loss) <= LARGEST_LOSS else f"a {name} of {loss:g} m^2, {limits}"
+
 
 class Answer(NamedTuple):
     """A client's weights (P,) after local training, and the number of its training pieces."""

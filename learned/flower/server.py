@@ -18,7 +18,7 @@ from coopoc.text import visible
 
 from ..checkpoint import Checkpoint, read_card, save
 from ..federation.history import Federation, Round
-from ..federation.rules import SERVER, rule, screen, too_few
+from ..federation.rules import SERVER, implausible, rule, screen, too_few
 from ..nets.gain import Gain, flatten
 from ..recipes import Job, untrained
 from .client import job_of, require_flower
@@ -34,8 +34,6 @@ STRATEGIES: dict[str, tuple[str, dict[str, Any]]] = {
     "krum": ("Krum", {"num_malicious_nodes": 1}),
 }
 """Flower's strategy for each rule of `federate`, with the rule's defaults."""
-LARGEST_LOSS = 1e12
-"""m^2, the largest plausible loss: an error of 1,000 km."""
 LONGEST_TEXT = 200
 """Characters of a name or a reason in an answer."""
 MOST_PIECES = 10
@@ -240,8 +238,8 @@ def _problem(content: Any, loss: str) -> str:
         return f"a name that is not 1 to {LONGEST_TEXT} printable characters, or the server's"
     if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
         return "a number of pieces that is not in 1..2^31 - 1"
-    if not 0 <= value <= LARGEST_LOSS:
-        return f"a {loss} of {value:g} m^2, must be in [0, {LARGEST_LOSS:g}]"
+    if why := implausible(loss, value):
+        return why
     if theirs != version("coopoc"):
         return f"made by another version of coopoc, the server has {version('coopoc')}: install the same"
     if loss == "training-loss" and (kind := content["arrays"]["theta"].numpy().dtype) != "float32":
@@ -272,7 +270,7 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
                 tuple(row.training_loss.get(name, nan) for name in names),
                 tuple(last[name] for name in names),
                 dict.fromkeys(row.training_loss, size + 4),
-                dict.fromkeys(row.training_loss, size),
+                dict.fromkeys(row.training_loss, 2 * size),  # to train, and to validate
                 row.rejected,
                 dict.fromkeys(absent, "no answer") if row.number else {},
                 row.note,

@@ -134,16 +134,8 @@ class NoiseParameters(Gain):
         """
         every = Segments.join(parts)
         innovations = scan(self.stds(flatten([self])), every.batch(torch.arange(len(every))[None]))[1]
-        return self.with_logs(self.logs + log_scale(innovations.square().nanmean((0, 1, 2))))
-
-
-def log_scale(squares: Tensor) -> Tensor:
-    """Logarithm of the std whose square is the mean of normalised innovations; 0 on an axis that has none.
-
-    >>> log_scale(torch.tensor([1.0, 0.0])).tolist()
-    [0.0, 0.0]
-    """
-    return 0.5 * torch.where(squares > 0.0, squares, 1.0).log()
+        squares = innovations.square().nanmean((0, 1, 2))  # NaN on an axis without any, whose scale stays
+        return self.with_logs(self.logs + 0.5 * torch.where(squares > 0.0, squares, 1.0).log())
 
 
 OF_PACE = MotionNoise(np.zeros(3), np.ones(3), 0.0, 0.0, 0.0)
