@@ -124,7 +124,7 @@ class LearnedGain(Alone):
 def moves(off: Floats, speeds: Floats) -> Bools:
     """Where a fix is off the start, or the odometry moves. Until then the start is held: a net has no height for a
     drive in one plane."""
-    return (abs(off) > 0.0) | (speeds != 0.0)
+    return np.asarray((abs(off) > 0.0) | (speeds != 0.0))
 
 
 def _lanes(array: Floats) -> Tensor:

@@ -389,7 +389,7 @@ def test_one_client_cannot_select_the_untrained_round(false, clients):
     curve[:, 0] = [1e-9, *[false] * 7]
     fed = federation(curve)
     card = fed.card | {"training_pieces": fed.sizes, "clients": fed.names}
-    assert fed.best.number == Checkpoint(fed.model, card).kept(7) >= 6
+    assert fed.best.number == Checkpoint(fed.like, card).kept(7) >= 6
 
 
 def test_honest_reports_select_the_least_mean():
