@@ -230,6 +230,34 @@ def test_a_stream_forgets_whom_it_met_long_ago():
     assert len(stream._last) < 60
 
 
+NOMINAL = CooperativeFilter(NoiseModel.nominal(Sensors()))
+
+
+def test_a_star_follows_again_after_a_pause_of_one_step():
+    """A minute without a fix counted as one in which fixes agreed: a place that they contradict was kept for good."""
+    stream, noise = StarStream(NOMINAL), default_rng(0).normal(0, 1.5, (70, 3))
+    for k, error in enumerate(noise):
+        if k == 30:
+            stream.step(None, [0, 0, 0], 60.0)
+        place = 10.0 * k * np.array([1, 0, 0]) + [0, 5000 * (k >= 30), 0]
+        x, _ = stream.step(place + error, [10, 0, 0], 1.0)
+    assert abs(x - place).max() < 10.0
+
+
+def test_velocities_of_short_and_long_steps_are_alike_plausible():
+    """A long step after a short one seemed implausible, its variance divided by the other's time: 2.7 m, not 1.6."""
+    stream, draw, errors = StarStream(NOMINAL, interval=0.1), default_rng(0), []
+    for k in range(600):
+        dt = 0.199 if k % 2 else 0.001
+        noise, place = (
+            0.1 * abs(U) * np.sqrt(0.1 / dt) * draw.normal(size=3),
+            U * (0.1 * (k - k % 2) + 0.001 + 0.199 * (k % 2)),
+        )
+        x, _ = stream.step(place + draw.normal(0, 1.5, 3) if k % 10 == 0 else None, U + noise, dt)
+        errors.append(x - place)
+    assert np.sqrt(np.square(errors[100:]).sum(axis=1).mean()) < 2.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("log", ["bundled", "KITTI 00"])
 def test_the_replay_runs(log):

@@ -517,7 +517,7 @@ class Oracle:
         dt = self.dt
         trusted = self.ego in s.trusted
         if trusted and s.hits.get(self.ego, 0) == 0:
-            s.agreed += dt
+            s.agreed += min(dt, 1.0)
         elif s.agreed < ESTABLISHED or not trusted:
             s.agreed = max(min(s.agreed, ESTABLISHED) - 1.5 * dt, 0.0)
         s.unseen += dt

@@ -339,7 +339,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     ego[SINCE_FIX] += own[DT]
     trusted = f.status[who[0, VEHICLE], TRUSTED] > 0.0
     if who[0, REJECTED] == 0 and trusted:
-        ego[AGREED] += own[DT]
+        ego[AGREED] += min(own[DT], 1.0)  # a long step shows no more than a fix
     elif ego[AGREED] < ESTABLISHED or not trusted:
         # faster, so that a start of 10 s that was wrong is left 10 s later
         ego[AGREED] = max(min(ego[AGREED], ESTABLISHED) - 1.5 * own[DT], 0.0)

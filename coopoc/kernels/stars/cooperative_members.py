@@ -167,14 +167,14 @@ def replace_implausible_velocity(
     changed = (ACCELERATION * since) ** 2
     for c in range(3):
         gap = unit * row[first + c] - status[PACE + c]
-        q += gap * gap / ((row[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
+        q += gap * gap / (row[variance + c] / dt**2 + status[PACE + 3 + c] + changed)
     if model.forget > 0.0:
         more = (min(q, WIDEST) / 3.0 - 1.0) / min(f.ego[STEPS] + 1.0, CHANGES)
         status[LOUDER] = max(status[LOUDER] + (1.0 + status[LOUDER]) * more, 0.0)
     if model.slip > 0.0 and model.fix_gate > 0.0 and q > WILD and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
-            row[first + c], row[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
+            row[first + c], row[variance + c] = status[PACE + c] / unit, (status[PACE + 3 + c] + changed) * dt * dt
         return
     if model.fix_gate > 0.0 and since < math.inf:
         x, y, keep = unit * row[first], unit * row[first + 1], math.exp(-since / TURN_MEMORY_S)
@@ -182,7 +182,7 @@ def replace_implausible_velocity(
         status[PACE2] = keep * status[PACE2] + since * (x * x + y * y)
     status[SINCE], status[SLIPS] = f.ego[CLOCK], 0.0
     for c in range(3):
-        status[PACE + c], status[PACE + 3 + c] = unit * row[first + c], row[variance + c]
+        status[PACE + c], status[PACE + 3 + c] = unit * row[first + c], row[variance + c] / dt**2
 
 
 @part

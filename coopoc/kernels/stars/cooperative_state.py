@@ -47,8 +47,8 @@ REVOKED, LOUDER, NOISE, CROSS, PACE2, STATUS = 23, 24, 25, 26, 27, 28
 - COUNT, MEAN, NOISE: number of fixes in the mean innovation, that mean m, and the variance m^2 of a fix's noise in it
   (sum of the axes).
 - USED, LAST: when its last used message was sent, s (-inf for none), and SOLO, SOLO_VARIANCE and ODOMETER of it.
-- PACE, SINCE, SLIPS: its last plausible velocity m/s with the variance of one step's motion m^2, when that was s (-inf
-  for never), and how many implausible ones have followed.
+- PACE, SINCE, SLIPS: its last plausible velocity m/s with its variance m^2/s^2, when that was s (-inf for never), and
+  how many implausible ones have followed.
 - REVOKED: how often it lost trust.
 - LOUDER: relative increase of the variance of its velocities over the assumed one.
 - CROSS, PACE2: sums, with a memory of TURN_MEMORY_S, of the cross products of velocities that follow each other, and of
@@ -143,7 +143,7 @@ AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, OFF, EGO = 73, 74, 
 - BARE: variances m^2 of ANSWER before `lasting` adds to them, and after the motion since then.
 - LEFT: the remembered position m that fixes led away from, its variance m^2 (NOT_REMEMBERED_M2 for none), the two
   numbers of `gate.remember`, and the distance driven since, m.
-- AGREED: s for which fixes have agreed with the position, less s for which they have not.
+- AGREED: s for which fixes have agreed with the position, a step's at most 1, less s for which they have not.
 - SINCE_FIX: s since the last fix.
 - CORRECTED: m^2 that fixes add to the variance of this step's motion where they correct it, else 0.
 - ERRORS, VOTES: eight numbers of `lasting`; nine of `gate.vote`.
