@@ -42,6 +42,13 @@ def test_solo_bound_tends_to_the_riccati_solution():
     )
 
 
+@pytest.mark.parametrize("z", [0.0, 9.0])
+def test_two_vehicles_are_at_best_one_with_two_fixes(z):
+    """At one place, and one straight above the other, where an azimuth has no direction."""
+    bound = posterior_bound(standing([[0, 0, 0], [0, 0, z]]), replace(S2, min_range=0.0), 0, V2X(1))[0]
+    assert (np.diag(bound) > 0.499 * 3.5**2).all()
+
+
 def node(vehicle, step):
     return int(gtsam.symbol(chr(97 + vehicle), step))
 

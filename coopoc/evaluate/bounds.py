@@ -26,8 +26,8 @@ from ..world.v2x import V2X
 
 NO_ERROR = 1e-18
 """m^2, variance of an error of the fixes that there is not."""
-MIN_GROUND_DISTANCE = 1e-6
-"""m, of the distance in the plane: straight above one another, two vehicles have no azimuth."""
+MIN_DISTANCE = 1e-3
+"""m, below which an angle's information would cancel all other; nearer in the plane, vehicles have no azimuth."""
 
 
 def posterior_bound(
@@ -391,9 +391,9 @@ def vector_information(edges: Edges, std: Floats) -> Floats:
     r"""Information (E, 3, 3) 1/m^2 of relative vectors, $\sum_k \nabla h_k \nabla h_k^\top / \sigma_k^2$ over what is
     measured of range, azimuth and inclination."""
     away, azimuth, inclination = spherical(*edges.vector.T)
-    flat = np.maximum(np.hypot(*edges.vector[:, :2].T), MIN_GROUND_DISTANCE)
-    gradients = directions(azimuth, inclination) / np.stack([np.ones_like(away), flat, away], 1)[..., None]
-    weight = np.square(std) ** -1.0 * edges.measured
+    levers = np.stack([np.ones_like(away), np.hypot(*edges.vector[:, :2].T), away], 1)
+    gradients = directions(azimuth, inclination) / np.maximum(levers, MIN_DISTANCE)[..., None]
+    weight = np.square(std) ** -1.0 * edges.measured * (levers > [0.0, MIN_DISTANCE, 0.0])
     return np.asarray(gradients.mT @ (weight[..., None] * gradients))
 
 

@@ -121,7 +121,7 @@ def find_links(
 ) -> Links:
     """Links of each observer to its K nearest vehicles in [min_range, radius], by step, observer, distance.
 
-    Vehicles at one distance come by column. Near vehicles are looked up in a k-d tree.
+    Vehicles at one distance come by column, at one place there is none. Near vehicles are looked up in a k-d tree.
 
     Args:
         fleet: the truth.
@@ -138,7 +138,7 @@ def find_links(
         position = fleet.position[first : first + at_once]
         observer, other = _near(position, columns, v2x.radius)
         gap = norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[observer], axis=1)
-        fits = (gap <= v2x.radius) & (gap >= min_range) & (observer != other)
+        fits = (gap <= v2x.radius) & (gap >= min_range) & (gap > 0.0)
         observer, other, gap = observer[fits], other[fits], gap[fits]
         order = np.lexsort((other, gap, observer))
         observer, other = observer[order], other[order]
