@@ -65,7 +65,7 @@ def test_a_method_of_ones_own_beside_others(folder):
     table = shell(f"{command} --tracks tum", folder)
     rows, fleet = Results.load(folder / "runs/side_by_side").select(method="alpha.py:Alpha"), load_fleet("town10")
     for _, row in rows.iterrows():
-        name = f"{row['max_neighbours']}-alpha.py_Alpha-nominal-{row['ego']}-run{row['run']}.tum"
+        name = f"{row['max_neighbours']},alpha.py%3AAlpha,nominal,{row['ego']}-run{row['run']}.tum"
         error = (
             np.loadtxt(folder / "runs/side_by_side/tracks" / name)[:, 1:4] - fleet.position[:, fleet.index(row["ego"])]
         )

@@ -17,7 +17,7 @@ from small_runs import files, numbers, shown
 import coopoc as co
 from coopoc.cli import _status
 from coopoc.study.publish import views
-from coopoc.study.run import WorkerDiedError, compute, plan, run_study, schedule
+from coopoc.study.run import WorkerDiedError, compute, plan, run_study, schedule, write_tracks
 from coopoc.study.study import Cell, Study
 from coopoc.world.storage import save_recording
 
@@ -175,6 +175,13 @@ def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path):
         raise ValueError("\ud800, half a pair")
 
     assert "half a pair" in run_study(Study("half", "?", half, {"x": (1,)}), tmp_path).failures["reason"][0]
+
+
+def test_each_track_has_a_file_of_its_own(tmp_path):
+    track = "ego", [0, 1], np.zeros((2, 3))
+    study = Study("s", "?", lambda p: [{"y": 1}], {"k": ("a b", "a_b")}, tracks=lambda p: [track])
+    run_study(study, tmp_path)
+    assert len([*write_tracks(study, tmp_path, {}).iterdir()]) == 2
 
 
 def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first():

@@ -4,7 +4,6 @@ publish the views.
 
 import itertools
 import os
-import re
 import sys
 import time
 import traceback
@@ -12,6 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import quote
 
 import pyarrow as pa
 from joblib import Parallel, delayed, parallel_config
@@ -177,7 +177,7 @@ def write_tracks(study: Study | str, out: str | Path, settings: Params) -> Path:
         settings: changes of the study's settings or axes.
 
     Returns:
-        The folder of the files, whose names begin with the parameters of the cell.
+        The folder of the files, whose names begin with the parameters of the cell, as in a URL.
 
     Raises:
         InputError: a study whose cells have no estimates.
@@ -188,8 +188,8 @@ def write_tracks(study: Study | str, out: str | Path, settings: Params) -> Path:
     for cell in cells:
         if store.load(folder.parent, cell.name) is not None:
             for name, *path in tracks(cell.settings):
-                words = [str(value) for value in cell.params.values()]
-                write_tum(folder / (re.sub(r"[^\w.+-]", "_", "-".join([*words, name])) + ".tum"), *path)
+                words = [quote(str(value), safe="") for value in (*cell.params.values(), name)]
+                write_tum(folder / f"{','.join(words)}.tum", *path)
     return folder
 
 
