@@ -124,13 +124,10 @@ class Multipliers:
     @cached_property
     def matrix(self) -> Any:
         """L (bound, bound), sparse."""
-        from scipy.sparse import csc_array
+        from scipy.sparse import block_diag
 
-        stiefel, sphere = self.problem.stiefel, self.problem.sphere
-        row, col = np.broadcast_arrays(stiefel[:, :, None], stiefel[:, None, :])
-        row, col = (np.concatenate([part.ravel(), sphere.ravel()]) for part in (row, col))
-        data = np.concatenate([self.stiefel.ravel(), np.broadcast_to(self.sphere[:, None], sphere.shape).ravel()])
-        return csc_array((data, (row, col)), shape=(self.problem.bound, self.problem.bound))
+        unit = np.eye(self.problem.sphere.shape[1])
+        return block_diag([*self.stiefel, *(unit * each for each in self.sphere)], format="csc")
 
 
 def multipliers(problem: Quadratic, X: Floats, CX: Floats) -> Multipliers:

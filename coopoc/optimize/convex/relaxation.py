@@ -77,8 +77,6 @@ class Reduced:
 
     def times(self, X: Floats) -> Floats:
         """C X."""
-        if self.problem.bound <= FORMED_ROWS:
-            return self.matrix @ X
         return np.asarray(self._rows[:, : self.problem.bound].T @ (self._rows @ self._all(X)))
 
     def settle(self, X: Floats) -> Floats:
