@@ -68,9 +68,9 @@ class Incremental:
             if len(vector) not in (d, space.ambient):
                 allowed = f"must be {d} numbers of a point or {space.ambient} of a pose"
                 raise InputError("values", f"{name}: {len(vector)} numbers", allowed, "Make poses with coopoc.pose.")
-            if turned := space.has_rotation and len(vector) > d:
+            if turned := len(vector) > d:
                 late_poses.add(first + k)
-            x[k] = vector if turned else space.join(vector[:d])
+            x[k] = vector if turned else space.join(vector)
         points(space, len(x), "values", x)
         every, fresh = [*self.names, *new], {name: first + k for k, name in enumerate(new)}
         index_of_name = ChainMap(fresh, self._place)

@@ -227,7 +227,7 @@ def _challenged(
     if not np.isfinite(cost) or first.iterations >= options.get("max_iterations", np.inf):
         return problem, first
     search = problem.search
-    near = record[0, 0] - cost <= RIVAL_COST or ((whole or bool(problem.poses)) and smooth(record))
+    near = record[0, 0] - cost <= RIVAL_COST or ((whole or problem.poses) and smooth(record))
     if near and (whole or search.start):
         return problem, first
     if near:
@@ -237,7 +237,7 @@ def _challenged(
             return problem, first
     else:
         astray = abs(x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(x, axis=0).max()
-        other = _measured(problem, x, bool(not whole and (astray or not smooth(record))))
+        other = _measured(problem, x, not whole and (astray or not smooth(record)))
         won = other.search
     saved = cost - (least := system.cost(np.asarray(other.x0)))
     if higher(cost, least) and (not near or saved > RIVAL_COST):

@@ -133,8 +133,6 @@ def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:
     >>> _split(np.array([[2.0, 0.0]]), np.array([4.0]))[0].round()
     array([-2.,  0.])
     """
-    if not len(unit):
-        return np.zeros(unit.shape[1]), np.eye(unit.shape[1])
     left, values, right = np.linalg.svd(unit)
     rank = int((values > DEPENDENT).sum())
     return -right[:rank].T @ ((left[:, :rank].T @ gap) / values[:rank]), right[rank:].T

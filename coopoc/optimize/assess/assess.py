@@ -127,7 +127,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         far, gain = float(abs(dx).max(initial=0.0)), 0.5 * abs(float(gradient @ dx))
         return Assessment(cost, size, cov, far, predicted=gain, curved=curved, leverage=leverage)
 
-    own, cov = _largest(problem, entries, values[entries.diagonal]), none
+    own, cov = _largest(problem, values[entries.diagonal]), none
     step = variance = np.full(entries.size, inf)
     leverage = 0.0
     if held := cholesky.factor(values):
@@ -140,7 +140,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         return _unconstrained(problem, x, covariance)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
-        scale, steepness = own + (own == 0), _largest(problem, entries, abs(gradient))
+        scale, steepness = own + (own == 0), _largest(problem, abs(gradient))
         flat = FLAT_CURVATURE + (steepness / scale + np.finfo(float).eps * abs(x).max()) / LEVER
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
@@ -155,9 +155,9 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
     return ended(inverse, newton, True) if (2.0 * less < variance).any() else ended(cov, step)
 
 
-def _largest(problem: Problem, entries: Entries, numbers: Floats) -> Floats:
+def _largest(problem: Problem, numbers: Floats) -> Floats:
     """(m,) the largest of such numbers among the positions, or the turns, of the node of each unknown."""
-    number, d = entries.number, problem.dimension
+    number, d = sparse(problem).entries.number, problem.dimension
     table = np.append(numbers, 0.0)[number]
     for part in (table[:, :d], table[:, d:]):
         part[:] = part.max(axis=1, initial=0.0, keepdims=True)
@@ -411,7 +411,7 @@ def as_stated(problem: Problem) -> Problem:
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
     """(M,) |W (h(x) - z)|^2 of the measurements of a factor at x (n, ambient)."""
-    (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], None, x).residual
+    (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], x).residual
     return np.asarray(np.vecdot(residual, residual))
 
 

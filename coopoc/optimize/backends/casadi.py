@@ -93,7 +93,7 @@ def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
     parts, sides = [x, *system.numbers], [np.empty((2, 0))]
     for c in problem.constraints:
         item = as_factor(c)
-        (value,) = linearise(problem.space, [item], None, x).residual
+        (value,) = linearise(problem.space, [item], x).residual
         item = unchecked(item, z=item.z + value * ~c.measurement.angles(problem.dimension))
         parts.append(numbers_of(item))
         sides.append((np.stack([c.lower, c.upper]) - item.z)[:, steerable(c, problem.movable)])

@@ -224,7 +224,7 @@ def callbacks(problem: Problem, factors: Sequence[Factor]) -> Callable[[int, int
             nonlocal at, linear, turned
             if at is None or not estimates.equals(at, 0.0):
                 at, x = gtsam.Values(estimates), estimate(space, posed, estimates)
-                linear, turned = linearise(space, bare, None, x), tangent(space, posed, x)
+                linear, turned = linearise(space, bare, x), tangent(space, posed, x)
             if jacobians is not None:
                 for slot, own in enumerate(np.split(linear.jacobian[k][row], len(nodes), axis=1)):
                     jacobians[slot] = own @ turned[nodes[slot]]

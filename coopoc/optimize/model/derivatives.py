@@ -336,8 +336,8 @@ class Linear:
     cost: float
 
 
-def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats) -> Linear:
-    """Factors around x (n, ambient); what is not `movable` (n, dof) has no derivative."""
+def linearise(space: Space, factors: Sequence[Factor], x: Floats) -> Linear:
+    """Factors around x (n, ambient)."""
     from ...kernels.graphs.graph_tape import accumulate
 
     wholes, cost = [], 0.0
@@ -351,8 +351,6 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
             whole *= np.sqrt(factor.loss.weight(square))[:, None, None]
             square = factor.loss.cost(square)
         cost += 0.5 * float(square.sum())
-        if movable is not None:
-            whole[..., 1:] *= movable[nodes].reshape(len(nodes), 1, -1)
         wholes.append(whole)
     return Linear(tuple(w[..., 0] for w in wholes), tuple(w[..., 1:] for w in wholes), cost)
 

@@ -3,8 +3,8 @@ of what users give for them.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import InitVar, dataclass, fields
-from functools import cache, cached_property, lru_cache
+from dataclasses import InitVar, dataclass
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -302,8 +302,8 @@ def unchecked(made: Made, **changes: Any) -> Made:
     """A factor, or another dataclass, with changes that come from checked arrays and need not be checked again."""
     kind: Any = type(made)
     changed: Made = object.__new__(kind)
-    kept = made.__dict__
-    changed.__dict__.update({name: kept[name] for name in names_of(kind)}, **changes)
+    fields = {name: value for name, value in made.__dict__.items() if name in kind.__match_args__}
+    changed.__dict__.update(fields, **changes)
     return changed
 
 
@@ -314,12 +314,6 @@ def stacked(arrays: Iterable[AnyArray], *width: int) -> AnyArray:
     (0, 2)
     """
     return np.concatenate([*arrays] or [np.empty((0, *width), int)])
-
-
-@cache
-def names_of(kind: Any) -> tuple[str, ...]:
-    """Of the fields of a dataclass."""
-    return tuple(field.name for field in fields(kind))
 
 
 def taken(factor: Factor, rows: Ints) -> Factor:

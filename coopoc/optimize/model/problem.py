@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -123,7 +123,7 @@ class Problem:
     @cached_property
     def space(self) -> Space:
         """Where the nodes live."""
-        return _space(self.dimension, bool(self.poses))
+        return Space(self.dimension, bool(self.poses))
 
     @cached_property
     def movable(self) -> Bools:
@@ -237,7 +237,7 @@ class Problem:
 
     def linearise(self, x: ArrayLike) -> Linear:
         """Whitened residuals and derivatives at x (n, ambient)."""
-        return linearise(self.space, self.factors, self.movable, self._at(x))
+        return linearise(self.space, self.factors, self._at(x))
 
     def whiten(self, x: ArrayLike) -> tuple[Floats, Any]:
         """Residual r (rows,) and sparse Jacobian J (rows, n dof) at x (n, ambient): cost = 1/2 r.r.
@@ -298,10 +298,6 @@ class Problem:
         return f"Problem({len(self.names)} {what}{plane}; {kinds}{bound})"
 
 
-_space = cache(Space)
-"""The one space of its kind."""
-
-
 def indices(index: Callable[[Any], int], kind: str, nodes: Any) -> Ints:
     """Nodes (M, arity) of a kind from one node, a tuple or rows of them, each found by `index`."""
     arity, rows = lookup(kind).arity, [several(row) for row in several(nodes)]
@@ -346,10 +342,13 @@ def no_such_node(
 
 
 def linearised(problem: Problem, x: Floats) -> tuple[Linear, Any]:
-    """`Problem.linearise` at x (n, ambient), which need not be checked, and the sparse Jacobian (rows, n dof), CSR."""
-    linear, (n, dof) = linearise(problem.space, problem.factors, problem.movable, x), problem.movable.shape
-    columns = [(dof * f.nodes[:, :, None] + np.arange(dof)).reshape(len(f.nodes), -1) for f in problem.factors]
-    return linear, row_matrix(zip(linear.jacobian, columns, strict=True), n * dof)
+    """`Problem.linearise` at x (n, ambient), which need not be checked, and the sparse Jacobian (rows, n dof), CSR, by
+    what can move."""
+    linear, movable, dof, blocks = linearise(problem.space, problem.factors, x), problem.movable, problem.space.dof, []
+    for f, jacobian in zip(problem.factors, linear.jacobian, strict=True):
+        own = (dof * f.nodes[:, :, None] + np.arange(dof)).reshape(len(f.nodes), -1)
+        blocks.append((jacobian * movable.ravel()[own][:, None], own))
+    return linear, row_matrix(blocks, movable.size)
 
 
 def row_matrix(blocks: Iterable[tuple[Floats, Ints]], width: int) -> Any:

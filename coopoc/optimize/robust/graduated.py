@@ -178,7 +178,7 @@ def graduate(
 def from_convex(marked: Marked, inner: Inner, start: Floats, most: float = inf) -> Graduation:
     """The graduation of all from a start (n, ambient) and a convex surrogate, until that costs more than `most`."""
     x = inner(marked.problem.starting_at(start))
-    return graduate(marked, inner, x, first_mu(float((marked.squares(x) / marked.bound).max())), most=most)
+    return graduate(marked, inner, x, first_mu((marked.squares(x) / marked.bound).max()), most=most)
 
 
 def contest(

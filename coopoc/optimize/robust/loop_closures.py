@@ -101,7 +101,7 @@ def _explained(marked: Marked, x: Floats, weight: Floats, group: int) -> bool:
         system = sparse(marked.reweigh(weight, x))
         costs.append(system.cost(arrive(system, x, 20, 1e-3).x if joins else x))
     good = 2.0 * (costs[1] - costs[0]) <= marked.bound[group]
-    weight[group] = float(good)
+    weight[group] = good
     return bool(good)
 
 
@@ -119,7 +119,7 @@ def predicted(marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats
         P = np.zeros(free.shape)
         P[free] = system.cholesky.inverse(*pairs)
         with np.errstate(all="ignore"):
-            linear = linearise(problem.space, [factor], None, x)
+            linear = linearise(problem.space, [factor], x)
             (J,), (r,) = linear.jacobian, linear.residual
             S = J @ P @ J.mT + np.eye(factor.size)
         # an angle between nodes that coincide has no derivative

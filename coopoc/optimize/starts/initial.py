@@ -49,7 +49,7 @@ def converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     own = values[system.entries.diagonal]
     values[system.entries.diagonal] = own + RIDGE
     system.cholesky.factor(values)
-    return system.retract(x, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
+    return system.retract(x, -system.cholesky.solve(gradient)), own.min(initial=np.inf) > 0.0
 
 
 def directed(problem: Problem, x: Floats) -> Floats:
@@ -73,7 +73,7 @@ def undirected(problem: Problem, x: Floats) -> list[tuple[Factor, Ints]]:
     items = *problem.factors, *map(as_factor, problem.constraints)
     counts = [*(np.array(True) for _ in problem.factors), *map(bounded, problem.constraints)]
     with np.errstate(all="ignore"):
-        linear, undefined = linearise(problem.space, items, problem.movable, x), []
+        linear, undefined = linearise(problem.space, items, x), []
     for item, count, residual, jacobian in zip(items, counts, linear.residual, linear.jacobian, strict=True):
         bad = (count & ~np.isfinite(np.dstack([residual, jacobian])).all(2)).any(1)
         undefined += [(item, item.nodes[bad])] if bad.any() else []

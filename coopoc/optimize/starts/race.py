@@ -90,7 +90,7 @@ def race(
         return y
 
     def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
-        return arrived and bool(abs(cost_of(x) - mean) <= usual)
+        return arrived and abs(cost_of(x) - mean) <= usual
 
     def landed(x: Floats) -> Floats:
         end = descend(x, LATER_STEPS)
@@ -213,7 +213,7 @@ def smooth(record: Floats) -> bool:
     """Whether the gain ratio of every step of an Arrival was within 1/2 .. 3/2, without damping. An exact Hessian that
     was not positive definite does not count: J^T J goes on from there."""
     _, damping, gain = record.T
-    return bool(not damping.any() and (abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
+    return not damping.any() and (abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all()
 
 
 def drawn(
