@@ -207,7 +207,10 @@ def load(point: metadata.EntryPoint, name: str) -> Any:
 
 
 def _unknown(group: str, name: object) -> InputError:
-    return unknown(GROUPS.get(group, group), name, names(group), LISTED if group in GROUPS else None)
+    noun = GROUPS.get(group, group)
+    if str(name).endswith(".py"):
+        return InputError(noun, repr(name), "must name what the file has", f"Write {name}:NAME.")
+    return unknown(noun, name, names(group), LISTED if group in GROUPS else None)
 
 
 def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:

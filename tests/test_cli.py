@@ -55,6 +55,7 @@ def test_help_a_list_and_a_mistake_load_nothing_heavy_and_show_what_others_add(t
 NAMES = ("run", "table", "report", "list", "reference", "greet")
 MISTAKES = (
     ("run smal", "study = 'smal': must be one of"),
+    ("run mine.py", "Write mine.py:NAME."),
     ("rn", "command = 'rn': must be one of"),
     (
         "run small --set max_neighbours=-1",

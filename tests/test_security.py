@@ -118,7 +118,7 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(tmp_path, capsys):
 @pytest.mark.parametrize("name", ["../out", "/tmp/coopoc-out", "a/b", "..", "", "a\nb", 3, None])
 def test_a_manifest_cannot_name_another_folder(folder, tmp_path, name):
     edited(folder / "manifest.json", lambda m: {**m, "study": name})
-    with refused(r"must be a file name|holds a damaged manifest\.json \(study is a"):
+    with refused(r"must be a file name|holds a damaged manifest\.json \(it has no str study"):
         Results.load(folder)
 
 

@@ -93,4 +93,4 @@ def test_the_code_of_a_plugin_names_cells(site):
         (site / "own_method.py").write_text(f"class Own:\n    gain = {gain}\n")
         lineup._code.cache_clear()
         names.append(study.cells()[0].name)
-    assert names[0] != names[1]
+    assert len({*names}) == 2

@@ -73,6 +73,9 @@ def test_a_reference_that_is_no_number_is_damaged(results, tmp_path, field):
     replace(known, numbers=(replace(known.numbers[0], **{field: float("nan")}),)).save(tmp_path / "numbers.json")
     with refused("is damaged .nan is no finite number"):
         Reference.load(tmp_path / "numbers.json")
+    (tmp_path / "numbers.json").write_text("{")
+    with refused("Write them with coopoc reference"):
+        Reference.load(tmp_path / "numbers.json")
 
 
 def test_verdicts_know_the_direction(results, tmp_path):

@@ -38,43 +38,37 @@ class Outcome:
     seconds: float
 
 
-def content(
-    path: Path, fields: Mapping[str, Any], hint: str = "Give a folder in which coopoc run has finished a study."
-) -> dict[str, Any]:
+def content(path: Path, fields: Mapping[str, Any], hint: str = "") -> dict[str, Any]:
     """Fields of a JSON file in the folder of a study.
 
     Args:
         path: of the file.
         fields: name -> type that the file must have.
-        hint: if there is no such file, and none in a folder below.
+        hint: of errors about a file that coopoc run does not write.
 
     Raises:
         InputError: no such file, no JSON, or a field that is missing or of another type.
     """
     if not path.is_file():
         below = sorted(path.parent.glob(f"*/{path.name}"))
-        hint = f"Give {below[0].parent}." if below else hint
+        hint = f"Give {below[0].parent}." if below else hint or "Give a folder that coopoc run has finished."
         raise InputError("folder", str(path.parent), f"holds no {path.name}", hint)
     try:
         text = path.read_text("utf-8")
-        document = json.loads(text)
+        document: dict[str, Any] = json.loads(text)
         if "\\ud" in text.lower():
             json.dumps(document, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
     except (ValueError, RecursionError) as error:
-        raise damaged(path, str(error)) from None
-    if not isinstance(document, dict):
-        raise damaged(path, f"a {type(document).__name__} instead of fields")
+        raise damaged(path, str(error), hint) from None
     for name, kind in fields.items():
-        if not isinstance(document.get(name), kind):
-            raise damaged(
-                path, f"{name} is a {type(document[name]).__name__}" if name in document else f"{name} is missing"
-            )
+        if not isinstance(document, dict) or not isinstance(document.get(name), kind):
+            raise damaged(path, f"it has no {kind.__name__} {name}", hint)
     return document
 
 
-def damaged(path: Path, damage: str) -> InputError:
+def damaged(path: Path, damage: str, hint: str = "") -> InputError:
     """The error for a file of a folder that cannot be used."""
-    hint = "Repeat coopoc run: finished cells are kept."
+    hint = hint or "Repeat coopoc run: finished cells are kept."
     return InputError("folder", str(path.parent), f"holds a damaged {path.name} ({damage})", hint)
 
 
