@@ -139,7 +139,6 @@ def package(tmp_path, monkeypatch):
         ("numbers", "FACTOR.real * x", "FACTOR.real * x + 1", False),
         ("numbers", "(1, 2)", "(2, 1)", False),
         ("views", "SHARED = 3", "SHARED = 4", False),
-        ("cells", "+ SHARED", "- SHARED", False),
         ("numbers", "FACTOR.real * x", "FACTOR.real * x  # doubled", True),
         ("numbers", "UNUSED = 1", "UNUSED = 2", True),
         ("views", "'old'", "'new'", True),
