@@ -226,8 +226,9 @@ def callbacks(problem: Problem, factors: Sequence[Factor]) -> Callable[[int, int
                 at, x = gtsam.Values(estimates), estimate(space, posed, estimates)
                 linear, turned = linearise(space, bare, x), tangent(space, posed, x)
             if jacobians is not None:
-                for slot, own in enumerate(np.split(linear.jacobian[k][row], len(nodes), axis=1)):
-                    jacobians[slot] = own @ turned[nodes[slot]]
+                own = linear.jacobian[k][row].reshape(-1, len(nodes), space.dof)
+                for slot, i in enumerate(nodes):
+                    jacobians[slot] = own[:, slot] @ turned[i]
             return linear.residual[k][row]
 
         return error
