@@ -33,7 +33,7 @@ class PoseTask(NamedTuple):
 def averaged(several: Sequence[Sensors]) -> tuple[Sensors, Floats]:
     """The first of some with the mean logarithms of what all have learned, and these logarithms (N, numbers): a
     federation of one round."""
-    names = [name for name in LEARNABLE.split() if getattr(several[0], name) > 0]
+    names = [name for name in LEARNABLE.split() if all(getattr(one, name) > 0 for one in several)]
     logs = np.log([[getattr(one, name) for name in names] for one in several])
     return replace(several[0], **dict(zip(names, np.exp(logs.mean(axis=0)).tolist(), strict=True))), logs
 

@@ -22,7 +22,7 @@ from .training.clients import Client, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives, measured_clients
 from .training.schedule import COUNT_LIMITS, Schedule
 
-REVISION = 7
+REVISION = 8
 """Raised whenever the training code changes what it makes of the same recipe."""
 Kind = Literal["federated", "centralised", "individual", "okf"]
 """Of training."""

@@ -19,7 +19,7 @@ from coopoc.plugins import in_file
 from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 
-from .checkpoint import Checkpoint, load, read_card, save
+from .checkpoint import Checkpoint, load, read, save
 from .federation.federate import federate
 from .nets.gain import Gain, flatten
 from .nets.okf import NoiseParameters
@@ -83,7 +83,7 @@ def train_all(
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     wanted = [job for name in recipes for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
     paths = {job: out / f"{job.label}.safetensors" for job in wanted}
-    missing = [job for job, path in paths.items() if not path.is_file() or _key(path) != job.key(fleet)]
+    missing = [job for job, path in paths.items() if _key(path) != job.key(fleet)]
     if missing:
         made_folder(out)
     if jobs > 1 and len(missing) > 1:
@@ -114,7 +114,9 @@ def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> 
     path = out / f"{job.label}.safetensors"
     if path.is_file() and _key(path) != checkpoint.card["key"]:
         kept = path.rename(path.with_suffix(f".{_key(path)[:8]}{path.suffix}"))
-        print(f"coopoc: what was trained otherwise is kept as {kept}", file=sys.stderr)
+        print(f"coopoc: what was trained otherwise, or is damaged, is kept as {kept}", file=sys.stderr)
+    if untrained_note := checkpoint.card.get("warning"):
+        print(f"coopoc: {job.label}: {untrained_note}", file=sys.stderr)
     save(path, checkpoint)
 
 
@@ -122,8 +124,11 @@ def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
     """The checkpoint of a job, trained now."""
     data = job_clients(job, fleet)
     made = TRAINERS[job.recipe.kind](job, data, f"train {job.name}" if progress else None)
-    errors = {"validation_m": errors_beside_fitted_filter(made.model, data)}
-    return replace(made, card=_card(job, fleet, data) | errors | dict(made.card))
+    card = _card(job, fleet, data) | {"validation_m": errors_beside_fitted_filter(made.model, data)} | dict(made.card)
+    if card.get("best") == 0:
+        rate = f"lower learning_rate={job.recipe.schedule.learning_rate:g}"
+        card["warning"] = f"no weights validated better than those of the start, which are kept; {rate}"
+    return replace(made, card=card)
 
 
 def errors_beside_fitted_filter(model: Gain, data: Sequence[Client]) -> tuple[float, float]:
@@ -146,7 +151,11 @@ def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | Non
 
 
 def _key(path: Path) -> str:
-    return str(read_card(path).get("key"))
+    """Of a checkpoint that can be read; no key of another one."""
+    try:
+        return str(read(path)[1].get("key"))
+    except InputError:
+        return "damaged"
 
 
 def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:

@@ -169,6 +169,12 @@ def test_what_cannot_be_federated_is_said_at_once(four, options, words):
         trained(four, **options)
 
 
+@pytest.mark.parametrize("part", ["training", "validation", "long"])
+def test_a_client_has_pieces_of_each_kind(four, part):
+    with refused(f"{part} = no piece"):
+        replace(four[0], **{part: getattr(four[0], part).take([])})
+
+
 def test_clients_have_names_of_their_own(four):
     for name in ("a", SERVER):
         with refused("clients = "):

@@ -107,14 +107,20 @@ def test_train_all_makes_every_recipe_and_resumes(tmp_path):
 
 @pytest.mark.usefixtures("quick")
 def test_what_changes_the_weights_changes_the_key(tmp_path, monkeypatch):
+    """A training that ends at its start warns; a damaged file is trained again."""
     fleet = drives()
     train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
     (path,) = tmp_path.iterdir()
     before = read_card(path)["key"]
-    faster = replace(recipes.RECIPES["centralised"], schedule=Schedule(epochs=3, batch=2, checks=2, learning_rate=2e-3))
+    faster = replace(recipes.RECIPES["centralised"], schedule=Schedule(epochs=3, batch=2, checks=2, learning_rate=50.0))
     monkeypatch.setitem(recipes.RECIPES, "centralised", faster)
     train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
-    assert read_card(path)["key"] != before
+    card = read_card(path)
+    assert card["key"] != before
+    assert "learning_rate=50" in card["warning"]
+    path.write_bytes(path.read_bytes()[:-1])
+    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
+    assert path.with_suffix(".damaged.safetensors").is_file()
 
 
 @pytest.mark.usefixtures("quick")

@@ -10,7 +10,7 @@ from test_pose_methods import WHITE, convoy, observed
 
 import coopoc as co
 from coopoc.evaluate.metrics import pose_covariance
-from coopoc.learned.pose_noise import PoseTask, fit_pose_noise, log_score
+from coopoc.learned.pose_noise import PoseTask, averaged, fit_pose_noise, log_score
 from coopoc.world.body_frames import true_heading
 
 
@@ -55,3 +55,8 @@ def test_odometry_that_means_nothing_is_learned_to_mean_nothing():
     start = replace(seen.sensors, velocity_std_ratio=0.8, azimuth_std=3.0)
     task = PoseTask(seen, fleet, fleet.ids, co.PoseFilter("fleet", exact=False), 5)
     assert fit_pose_noise([task], start, evaluations=60).velocity_std_ratio == 1.0
+
+
+def test_a_number_that_one_has_not_learned_is_not_averaged():
+    first = co.Sensors(yaw_rate_std=0.1)
+    assert averaged([first, replace(first, yaw_rate_std=0.0)])[0].yaw_rate_std == 0.1

@@ -59,7 +59,7 @@ def test_step_by_step_is_the_track(name, known, crossing):
     gnss[:, :flat, :, 2] *= 0.0
     velocity[:, :flat, :, 2] *= 0.0
     gnss[:, : int(known)] = np.nan
-    recording = replace(recording, gnss=gnss, velocity=velocity)
+    recording = replace(recording, t=2.0 * recording.t, gnss=gnss, velocity=velocity)
     track = (replace(method, x0=x0[None]) if known else method)(recording, [3])
     x, cov = play(start(x0) if known else start(), recording, 3, run=1, first=int(known))
     assert_allclose(x, track.x[1, known:, 0], atol=1e-5 if name == "net" else 1e-12)

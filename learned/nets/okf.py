@@ -57,18 +57,26 @@ class OptimisedKF(Alone):
         check_std(self, "gnss_std")
         check_fields(self)
 
-    def start(self, x0: ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
+    def start(
+        self, x0: ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
+    ) -> FilterStream:
         """The filter as a stream, one step at a time (docs/streaming.md).
 
         Args:
             x0: (3,) m, the exact start; None starts at the first fix.
-            interval: s, the step of the training; the variance of a motion of dt s is dt / interval times a step's.
+            interval: s, of a step: the variance of a motion of dt s is dt / interval times a step's; None: every motion
+                is one step, as in a recording.
             history: s, the oldest fix that is accepted.
 
         >>> OptimisedKF((1.0,) * 3, (0.0,) * 3, (1.0,) * 3).start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)[0]
         array([1., 2., 0.])
         """
-        return FilterStream(self._motion(check_interval(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
+        return FilterStream(
+            self._motion(0.0 if interval is None else check_interval(interval)),
+            FixNoise(np.square(self.gnss_std)),
+            x0,
+            history,
+        )
 
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:

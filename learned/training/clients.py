@@ -136,6 +136,16 @@ class Client:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        for name in ("training", "validation", "long"):
+            check_segments(name, getattr(self, name))
+
+
+def check_segments(field: str, value: object) -> None:
+    """InputError unless these are Segments of at least one piece."""
+    if not len(instance(field, value, Segments)):
+        raise InputError(
+            field, "no piece", "must have at least one", "Give a longer drive, or one that begins at a fix."
+        )
 
 
 def clients(

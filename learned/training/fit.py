@@ -18,7 +18,7 @@ from coopoc.world.sensors import stream
 from ..engine.backward import Moments, Update
 from ..nets.gain import Gain, flatten, unflatten
 from ..nets.okf import NoiseParameters
-from .clients import Batch, Segments, mirrored
+from .clients import Batch, Segments, check_segments, mirrored
 from .schedule import Schedule, cosine, generator, one_core, watched
 
 
@@ -92,12 +92,12 @@ def fit(
     """
     instance("model", model, Gain, "Give GainNet().")  # type: ignore[type-abstract]
     instance("schedule", schedule, Schedule)
-    for field, pieces in (
-        ("training", training),
-        ("validation", validation),
-        ("long", validation if long is None else long),
-    ):
-        instance(field, pieces, Segments)
+    for field, value in {
+        "training": training,
+        "validation": validation,
+        "long": validation if long is None else long,
+    }.items():
+        check_segments(field, value)
     began, theta, draw = time.perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
     plan, judge = schedule.plan(len(training), draw), Judge([[validation], *([] if long is None else [[long]])], model)
     history, so_far = [Progress(0, theta[0].clone(), nan, float(judge(theta)))], []
