@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import refused, winding
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from test_learned_engine import batch
 from torch import nn
 
@@ -114,16 +114,6 @@ def test_translating_the_world_translates_the_estimate():
     there = Fleet(here.ids, here.t, here.position + np.array([4e5, -5e6, 100.0]), here.velocity)
     tracks = [LearnedGain(GainNet())(observe(f, Sensors(), runs=2)).x for f in (here, there)]
     assert_allclose(tracks[1] - tracks[0], np.broadcast_to([4e5, -5e6, 100.0], tracks[0].shape), atol=1e-4)
-
-
-def test_a_given_start_is_used_and_its_shape_checked():
-    fleet = winding()
-    rec = observe(fleet, Sensors(), runs=2)
-    assert_array_equal(
-        LearnedGain(GainNet(), x0=fleet.position[0])(rec).x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3))
-    )
-    with refused("x0"):
-        LearnedGain(GainNet(), x0=np.zeros((5, 3)))(rec)
 
 
 def test_divergence_is_reported_and_nan_is_refused():

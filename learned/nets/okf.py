@@ -87,7 +87,7 @@ class OptimisedKF(Alone):
         return solo_track(recording, columns, x, variance, began)
 
     def _motion(self, interval: float) -> MotionNoise:
-        base, ratio = np.array(self.process_std, float), np.array(self.velocity_ratio, float)
+        base, ratio = np.array([self.process_std, self.velocity_ratio], float)
         return MotionNoise(base, ratio, 0.0, 0.0, interval)
 
 

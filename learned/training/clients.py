@@ -91,6 +91,10 @@ class Segments:
             raise InputError("pieces", agreed, "must agree in length, dt and start", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
+    def double(self) -> "Segments":
+        """The same pieces in float64."""
+        return self._each(lambda name: getattr(self, name).double())
+
     def _each(self, made: Callable[[str], Tensor]) -> "Segments":
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
         tensors: dict[str, Any] = {

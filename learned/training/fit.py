@@ -210,7 +210,7 @@ def fit_okf(
     2
     """
     began, like = time.perf_counter(), NoiseParameters()
-    data, judge = (_doubled(*padded([part])) for part in (training, validation))
+    data, judge = (padded([part.double()]) for part in (training, validation))
     logs = like.logs.detach().double().reshape(1, -1).clone().requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
@@ -227,14 +227,6 @@ def fit_okf(
         fall.step()
     made = like.with_logs(best.view(3, 3)).calibrate([training])
     return made, {"validation_loss": tuple(history), "seconds": time.perf_counter() - began}
-
-
-def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
-    """The same in float64."""
-    doubled: dict[str, Any] = {
-        name: value.double() for name, value in batch._asdict().items() if isinstance(value, Tensor)
-    }
-    return batch._replace(**doubled), share.double()
 
 
 def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
