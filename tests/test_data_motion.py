@@ -10,7 +10,7 @@ import pytest
 from conftest import refused
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
-from numpy import nan
+from numpy import arange, array, cos, cumsum, gradient, isfinite, nan, sin, where
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -23,25 +23,25 @@ from coopoc.kernels.constant_velocity import BANK, constant_velocity
 from coopoc.world.body_frames import in_world, turned
 from coopoc.world.links import wrap
 
-T = np.round(np.arange(0, 180, 0.1), 1)
+T = np.round(arange(0, 180, 0.1), 1)
 TUNNEL = [k for k in range(0, len(T), 10) if not 600 < k < 900]
 """Steps that have a fix."""
 FILTERS = co.Kalman(), co.JointFilter(), co.CooperativeFilter()
-SPEED, COURSE = 8 + 6 * np.sin(T / 17), np.cumsum(0.1 * 0.25 * np.sin(T / 9) * np.sin(T / 40))
+SPEED, COURSE = 8 + 6 * sin(T / 17), cumsum(0.1 * 0.25 * sin(T / 9) * sin(T / 40))
 """m/s and rad, of a car."""
-RATE = np.gradient(COURSE, 0.1)
+RATE = gradient(COURSE, 0.1)
 
 
 def path(name):
     """(T, 3) m: a car that stops, goes and turns; a drone; a slow robot."""
     if name == "drone":
-        return np.c_[3 * np.sin(T / 2.5), 3 * np.sin(T / 1.7 + 1), 1 + 0.5 * np.sin(T / 4)]
+        return np.c_[3 * sin(T / 2.5), 3 * sin(T / 1.7 + 1), 1 + 0.5 * sin(T / 4)]
     if name == "robot":
-        return np.c_[0.2 * T + np.sin(T / 20), np.cos(T / 11), 0 * T]
+        return np.c_[0.2 * T + sin(T / 20), cos(T / 11), 0 * T]
     if name == "town":
-        return np.cumsum(np.exp(0.5j * np.pi * (T // 25))[:, None] * [1, -1j, 0], axis=0).real
-    climb = 0.06 * (name == "hill") * np.sin(T / 10)
-    return np.cumsum(0.1 * SPEED[:, None] * np.c_[np.cos(COURSE), np.sin(COURSE), climb], axis=0)
+        return cumsum(np.exp(0.5j * np.pi * (T // 25))[:, None] * [1, -1j, 0], axis=0).real
+    climb = 0.06 * (name == "hill") * sin(T / 10)
+    return cumsum(0.1 * SPEED[:, None] * np.c_[cos(COURSE), sin(COURSE), climb], axis=0)
 
 
 def axes(u, frame=""):
@@ -52,11 +52,11 @@ def axes(u, frame=""):
 def log(folder, name, std, every, seed=0, steps=(), **more: Floats):
     """A log of noisy fixes at some of the steps, and of what else is measured at all of them; times and fixes."""
     x, rng = path(name), default_rng(seed)
-    k = np.array(steps) if len(steps) else np.arange(0, len(T), every)
+    k = array(steps) if len(steps) else arange(0, len(T), every)
     z, std = np.full_like(x, nan), np.broadcast_to(std, x.shape)
     z[k] = x[k] + rng.normal(0, std[k])
     drive = pd.DataFrame(z, columns=[*"xyz"]).assign(t=T, vehicle="a", **more)
-    drive[["x_std", "y_std", "z_std"]] = np.where(np.isfinite(z), std, nan)
+    drive[["x_std", "y_std", "z_std"]] = where(isfinite(z), std, nan)
     folder.mkdir(parents=True, exist_ok=True)
     drive[drive[["x", *more]].notna().any(axis=1)].to_csv(folder / "a.csv", index=False)
     pd.DataFrame(x, columns=[*"xyz"]).assign(t=T, vehicle="a").to_csv(folder / "truth.csv", index=False)
@@ -72,11 +72,11 @@ def filtered(t, z, std, density):
     """filterpy's positions (M, 3) m and velocities m/s after each fix."""
     kf, x, u = KalmanFilter(dim_x=2, dim_z=1), np.empty_like(z), np.empty_like(z)
     for c in range(3):
-        kf.x, kf.P = np.array([[z[0, c]], [0.0]]), np.diag([std**2, 100.0])
-        kf.R, kf.H = np.array([[std**2]]), np.array([[1.0, 0.0]])
+        kf.x, kf.P = array([[z[0, c]], [0.0]]), np.diag([std**2, 100.0])
+        kf.R, kf.H = array([[std**2]]), array([[1.0, 0.0]])
         for k in range(len(t)):
             if k > 0:
-                kf.F = np.array([[1.0, t[k] - t[k - 1]], [0.0, 1.0]])
+                kf.F = array([[1.0, t[k] - t[k - 1]], [0.0, 1.0]])
                 kf.Q = Q_continuous_white_noise(2, t[k] - t[k - 1], density)
                 kf.predict()
                 kf.update(z[k, c])
@@ -86,12 +86,12 @@ def filtered(t, z, std, density):
 
 def test_one_filter_of_the_bank_is_filterpys():
     rng = default_rng(3)
-    t, w, std = np.cumsum(rng.uniform(0.2, 0.6, 60)), 0.4, 1.5
+    t, w, std = cumsum(rng.uniform(0.2, 0.6, 60)), 0.4, 1.5
     z = np.c_[3 * t, 0.2 * t**2, 0 * t] + rng.normal(0, 0.1, (60, 3))  # no innovation is clipped
     interval = float(np.median(np.diff(t)))
     velocity, *_ = constant_velocity(t, z, interval, 9.0, std**2, 10.0, np.full(7, w))
     assert_allclose(velocity, filtered(t, z, std, (w / interval) ** 4 * std**2)[1], atol=1e-9)
-    t, x = 5.0 * np.arange(200), 5 * np.cumsum(rng.normal(0, 2, (200, 3)), 0).cumsum(0)
+    t, x = 5.0 * arange(200), 5 * cumsum(rng.normal(0, 2, (200, 3)), 0).cumsum(0)
     proved = constant_velocity(t, x + rng.normal(0, std, x.shape), 5.0, 9.0, std**2, 10.0, BANK)[3]
     assert proved[9:].min() > 0.2 * std**2  # where gains near 1 fit any noise, that of fixes is as stated
 
@@ -104,7 +104,7 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, nam
     read, t, z = log(tmp_path, name, std, every)
     assert "no odometry of a" in " ".join(read.recording.notes)
     x = path(name)[np.searchsorted(T, t)]
-    densities = 10.0 ** np.arange(-3, 3.1, 0.5)
+    densities = 10.0 ** arange(-3, 3.1, 0.5)
     best = min(np.sqrt(np.square(filtered(t, z, std, q)[0] - x).sum(1).mean()) for q in densities)
     for method in FILTERS[: 2 + (name != "town")]:
         assert error(read, method) < 1.15 * best
@@ -113,8 +113,8 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, nam
 
 def test_a_velocity_that_few_fixes_show_is_no_surer_than_it_is(tmp_path):
     """Fixes of 5 cm, the first second: 25 cm off, and NEES 24 and 51 (Kalman filter, smoother)."""
-    t, names, std = 0.1 * np.arange(100), list("abcde"), 0.05
-    x = np.broadcast_to(15.0 * t[:, None, None] * np.array([1.0, 0.0]), (100, 5, 2))
+    t, names, std = 0.1 * arange(100), list("abcde"), 0.05
+    x = np.broadcast_to(15.0 * t[:, None, None] * array([1.0, 0.0]), (100, 5, 2))
     z = (x + default_rng(5).normal(0, std, x.shape)).reshape(-1, 2)
     table = pd.DataFrame(z, columns=["x", "y"]).assign(t=t.repeat(5), vehicle=names * 100, x_std=std, y_std=std)
     table.to_csv(tmp_path / "log.csv", index=False)
@@ -131,9 +131,9 @@ def test_a_velocity_that_few_fixes_show_is_no_surer_than_it_is(tmp_path):
 def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_path, frame, apart):
     """By SciPy's rotation; beside the filter that has the velocity in the world. Quaternions may be in a table of
     their own."""
-    u, std = np.gradient(path("drone"), 0.1, axis=0), np.full((len(T), 3), 0.1)
+    u, std = gradient(path("drone"), 0.1, axis=0), np.full((len(T), 3), 0.1)
     ideal = log(tmp_path / "world", "drone", 0.1, 10, **axes(u), **axes(std, "_std"))[0]
-    turn = Rotation.from_euler("ZYX", np.c_[0.3 * T, 0.2 * np.sin(T), 0.3 * np.cos(T)])
+    turn = Rotation.from_euler("ZYX", np.c_[0.3 * T, 0.2 * sin(T), 0.3 * cos(T)])
     q = dict(zip(("qx", "qy", "qz", "qw"), turn.as_quat().T, strict=True))
     own = axes(turn.inv().apply(u), "_body") | axes(std, "_body_std") | ({} if apart else q)
     log(tmp_path / "body", "drone", 0.1, 10, **own, yaw_rate=0 * T + 0.3)
@@ -148,7 +148,7 @@ def test_a_drone_that_tilts_and_moves_sideways_is_turned_by_its_quaternions(tmp_
 
 def test_a_body_velocity_that_errs_for_long_misleads_no_pose_filter(tmp_path):
     """By 3 % and 0.1 m/s on each axis; beside the filter that is told the errors, from when fixes have shown them."""
-    u, off, rng = np.gradient(path("drone"), 0.1, axis=0), list[float](), default_rng(5)
+    u, off, rng = gradient(path("drone"), 0.1, axis=0), list[float](), default_rng(5)
     heading = wrap(0.3 * T + rng.normal(0, 0.02, len(T)))
     turn = {"heading": heading, "heading_std": 0 * T + 0.02, "yaw_rate": 0 * T + 0.3}
     for name, bias in (("slow", 0.1), ("ideal", 0.0)):
@@ -166,7 +166,7 @@ def test_each_fix_counts_as_it_is_stated(tmp_path):
     """Of 2 cm but for half a minute."""
     poor = (T > 60) & (T < 90)
     u = SPEED * np.exp(1j * COURSE) + default_rng(2).normal(0, 0.1, (len(T), 2)) @ [1, 1j]
-    std = np.where(poor, 3.0, 0.02)[:, None]
+    std = where(poor, 3.0, 0.02)[:, None]
     read = log(tmp_path, "car", std, 2, vx=u.real, vy=u.imag, vz=0 * T, vx_std=0 * T + 0.1)[0]
     for method in (*FILTERS, co.BatchSmoother()):
         off = norm(method(read.recording).x[0, :, 0] - path("car"), axis=1)
@@ -175,7 +175,7 @@ def test_each_fix_counts_as_it_is_stated(tmp_path):
 
 
 def test_a_vehicle_without_odometry_adds_no_noise_to_that_of_others(tmp_path):
-    alone = log(tmp_path, "car", 1.5, 10, vx=SPEED * np.cos(COURSE), vy=SPEED * np.sin(COURSE), vz=0 * T)[0]
+    alone = log(tmp_path, "car", 1.5, 10, vx=SPEED * cos(COURSE), vy=SPEED * sin(COURSE), vz=0 * T)[0]
     pd.read_csv(tmp_path / "a.csv", usecols=["t", *"xyz"]).dropna().to_csv(tmp_path / "b.csv")
     both = co.read_log(tmp_path)
     for method in (*FILTERS, co.BatchSmoother()):
@@ -202,7 +202,7 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
 
 def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     """Beside a compass of 1 degree, on the way of a car; and what is known of no direction at the start is absent."""
-    rng, speed = default_rng(1), np.where(T > 0, SPEED, 0.0)
+    rng, speed = default_rng(1), where(T > 0, SPEED, 0.0)
     noise = {"speed_std": 0.1 + 0 * T, "yaw_rate_std": 0.001 + 0 * T}
     gyro = {"speed": speed, "yaw_rate": RATE + rng.normal(0, 0.001, len(T)), **noise}
     known = error(log(tmp_path / "known", "car", 1.0, 10, speed=speed, heading=COURSE)[0], co.Kalman())
@@ -216,7 +216,7 @@ def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
 
 @pytest.mark.parametrize("std", [0.05, 1.5])
 def test_the_speed_of_a_slow_robot_is_along_its_course(tmp_path, std):
-    pace = norm(np.gradient(path("robot"), 0.1, axis=0), axis=1)
+    pace = norm(gradient(path("robot"), 0.1, axis=0), axis=1)
     alone = error(log(tmp_path / "fixes", "robot", std, 10)[0], co.Kalman())
     assert error(log(tmp_path / "speed", "robot", std, 10, speed=pace)[0], co.Kalman()) < 1.1 * alone
 
@@ -266,8 +266,8 @@ def test_a_gap_splits_a_drive_in_every_method(tmp_path):
         assert 20 < track.absent.sum() < 32
         assert np.isnan(track.x[:, track.absent[:, 0]]).all()
         assert_allclose(track.x[:, slice(*second)], method(rec.between(*second)).x)
-        assert np.isfinite(co.rt_le(track, truth)).all()
-        assert np.isfinite(co.max_error(track, truth)).all()
+        assert isfinite(co.rt_le(track, truth)).all()
+        assert isfinite(co.max_error(track, truth)).all()
         assert any("no estimate there" in note for note in track.notes)
     with refused("absent"):
         co.Kalman()(replace(rec, velocity=nan * rec.velocity))
@@ -275,23 +275,23 @@ def test_a_gap_splits_a_drive_in_every_method(tmp_path):
 
 def test_hills_are_followed_by_fixes_that_are_denser_than_odometry(tmp_path):
     """Without a vertical velocity a height erred by 6 m; at steps of the odometry nine of ten fixes were lost."""
-    seldom = np.where(np.arange(len(T)) % 10, nan, 1.0)
+    seldom = where(arange(len(T)) % 10, nan, 1.0)
     read = log(tmp_path / "log", "hill", 1.5, 1, speed=SPEED * seldom, heading=COURSE * seldom)[0]
     assert read.recording.dt == 0.1
     assert error(read, co.Kalman()) < 0.3 * error(read, co.GNSS())
 
 
 def test_stamps_at_two_rates_are_kept(tmp_path):
-    steps = np.cumsum(np.tile([2, 3], 300))
+    steps = cumsum(np.tile([2, 3], 300))
     read, t, _ = log(tmp_path, "car", 1.5, 1, steps=steps[steps < len(T)].tolist())
-    assert np.isfinite(read.recording.gnss[0, :, 0, 0]).sum() == len(t)
+    assert isfinite(read.recording.gnss[0, :, 0, 0]).sum() == len(t)
 
 
 STRANGE = {
-    "stands, without noise": (0.0, np.arange(60.0)),
-    "two fixes": (8.0, np.arange(2.0)),
-    "bursts": (20.0, np.sort(np.ravel(np.arange(60.0)[:, None] + [0.0, 0.05, 0.9]))),
-    "a train": (80.0, 0.1 * np.arange(60)),
+    "stands, without noise": (0.0, arange(60.0)),
+    "two fixes": (8.0, arange(2.0)),
+    "bursts": (20.0, np.sort(np.ravel(arange(60.0)[:, None] + [0.0, 0.05, 0.9]))),
+    "a train": (80.0, 0.1 * arange(60)),
 }
 """Name -> m/s and the times of fixes, s."""
 
@@ -302,7 +302,7 @@ def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     speed, t = STRANGE[name]
     pd.DataFrame({"t": t, "vehicle": "a", "x": speed * t, "y": 0.0}).to_csv(tmp_path / "a.csv")
     rec = co.read_log(tmp_path / "a.csv").recording
-    known = np.flatnonzero(np.isfinite(rec.gnss[0, :, 0, 0]))
+    known = np.flatnonzero(isfinite(rec.gnss[0, :, 0, 0]))
     assert len(known) == len(t)
     for method in FILTERS:
         assert (norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)[4:] < 2.6).all()
@@ -343,7 +343,7 @@ def test_fixes_that_are_held_are_a_gap_where_nothing_else_moves(tmp_path, held):
 
 @pytest.mark.parametrize("every", [1, 20])
 def test_a_truth_may_be_seldom_and_without_heights(tmp_path, every):
-    read, *_ = log(tmp_path, "hill", 1.0, 10, **axes(np.gradient(path("hill"), 0.1, axis=0)))
+    read, *_ = log(tmp_path, "hill", 1.0, 10, **axes(gradient(path("hill"), 0.1, axis=0)))
     pd.read_csv(tmp_path / "truth.csv").drop(columns="z")[::every].to_csv(tmp_path / "truth.csv")
     assert error(co.read_log(tmp_path), co.Kalman()) < 1.5 * error(read, co.Kalman()) + 0.3
 
@@ -357,7 +357,7 @@ def test_a_truth_may_be_seldom_and_without_heights(tmp_path, every):
     ],
 )
 def test_what_a_log_holds_beside_its_odometry_is_named(tmp_path, fault, named):
-    u = np.gradient(path("drone"), 0.1, axis=0) - [1.5 * (fault == "wind"), 0, 0]
+    u = gradient(path("drone"), 0.1, axis=0) - [1.5 * (fault == "wind"), 0, 0]
     log(tmp_path, "drone", 0.05, 2, **axes(u * [1, 1, 1 - 2 * (fault == "down")]))
     (tmp_path / "truth.csv").unlink()
     rows = pd.read_csv(tmp_path / "a.csv")
@@ -373,5 +373,5 @@ def test_a_robot_without_heights_is_read_beside_a_drone(tmp_path):
     log(tmp_path, "drone", 0.1, 2)
     pd.read_csv(tmp_path / "a.csv").drop(columns=["z", "z_std"]).assign(vehicle="b").to_csv(tmp_path / "b.csv")
     read = co.read_log(tmp_path)
-    assert np.isfinite(read.recording.gnss[0, ::2]).all()
+    assert isfinite(read.recording.gnss[0, ::2]).all()
     assert np.ptp(read.recording.gnss[0, ::2, :, 2], axis=0)[1] == 0.0

@@ -7,6 +7,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 from conftest import DESCENTS, measured, refused
+from numpy import arange, array, concatenate, full, zeros
 from numpy.linalg import inv, norm
 from numpy.random import default_rng
 from random_graphs import AB, moved
@@ -28,8 +29,8 @@ def everything(dimension, noise=0.05):
     rng = default_rng(0)
     d, space = dimension, Space(dimension, has_rotation=True)
     names = (*(f"{robot}{k}" for robot in "AB" for k in range(4)), "L0")
-    position = np.concatenate([np.arange(4)[:, None] * 5.0 + row * 8.0 + np.zeros((4, d)) for row in (0, 1)])
-    position = np.concatenate([position, np.full((1, d), 12.0)]) + rng.normal(size=(9, d))
+    position = concatenate([arange(4)[:, None] * 5.0 + row * 8.0 + zeros((4, d)) for row in (0, 1)])
+    position = concatenate([position, full((1, d), 12.0)]) + rng.normal(size=(9, d))
     turn = 0.4 * rng.normal(size=(9, space.angles))
     turn[-1] = 0.0
     truth = space.join(position, exp(turn))
@@ -45,14 +46,14 @@ def everything(dimension, noise=0.05):
         size, constants = known.size(d), [0.5] * known.constants
         if known.compares_poses:
             moved = space.retract(
-                np.array([relative(space, truth, c) for c in nodes]), noise * rng.normal(size=(len(nodes), space.dof))
+                array([relative(space, truth, c) for c in nodes]), noise * rng.normal(size=(len(nodes), space.dof))
             )
-            problem = problem.add(kind, chosen, moved, std=np.full(size, 0.3))
+            problem = problem.add(kind, chosen, moved, std=full(size, 0.3))
             continue
-        zero = problem.add(kind, chosen, np.full((len(nodes), size), 1.0), std=1.0, constants=constants or None)
+        zero = problem.add(kind, chosen, full((len(nodes), size), 1.0), std=1.0, constants=constants or None)
         h = zero.linearise(truth).residual[-1] + 1.0
         problem = problem.add(
-            kind, chosen, h + noise * rng.normal(size=h.shape), std=np.full(size, 0.3), constants=constants or None
+            kind, chosen, h + noise * rng.normal(size=h.shape), std=full(size, 0.3), constants=constants or None
         )
     return problem, truth
 
@@ -73,7 +74,7 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     space, movable = problem.space, problem.movable.ravel()
     theirs = least_squares(
         lambda v: problem.whiten(moved(problem, truth, v))[0],
-        np.zeros(movable.sum()),
+        zeros(movable.sum()),
         xtol=1e-14,
         ftol=1e-14,
         gtol=1e-14,
@@ -82,17 +83,15 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
     assert found.x == pytest.approx(moved(problem, truth, theirs.x), abs=1e-6)
     J = problem.whiten(found.x)[1].toarray()[:, movable]
-    cov = np.zeros((movable.size, movable.size))
+    cov = zeros((movable.size, movable.size))
     cov[np.ix_(movable, movable)] = inv(J.T @ J)
-    assert found.covariance == pytest.approx(
-        cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)], abs=1e-9
-    )
+    assert found.covariance == pytest.approx(cov.reshape(9, space.dof, 9, space.dof)[arange(9), :, arange(9)], abs=1e-9)
 
 
 def test_a_turned_world_turns_the_estimate():
     """What is measured between bodies does not depend on the world: only the held pose turns, and all with it."""
     problem = from_graph(small(), start="file")
-    turn, shift, space = exp(np.array([0.7])), np.array([30.0, -4.0]), problem.space
+    turn, shift, space = exp(array([0.7])), array([30.0, -4.0]), problem.space
     moved = space.join(problem.x0[:, :2] @ turn.T + shift, turn @ space.rotation(problem.x0))
     a, b = solve(problem), solve(replace(problem, x0=moved, search=Search(x0=moved)))
     assert b.cost == pytest.approx(a.cost, abs=1e-12)
@@ -113,13 +112,13 @@ def test_exp_and_log_are_scipys():
     w[0] = 0.0
     assert exp(w) == pytest.approx(Rotation.from_rotvec(w).as_matrix(), abs=1e-12)
     assert log(exp(w)) == pytest.approx(w, abs=1e-9)
-    assert log(exp(np.array([[0.3], [-3.0]]))) == pytest.approx(np.array([[0.3], [-3.0]]))
+    assert log(exp(array([[0.3], [-3.0]]))) == pytest.approx(array([[0.3], [-3.0]]))
 
 
 def test_full_covariances_weigh_as_their_inverse():
-    cov = np.array([[4.0, 1.0, 0], [1.0, 2.0, 0.5], [0, 0.5, 3.0]])
+    cov = array([[4.0, 1.0, 0], [1.0, 2.0, 0.5], [0, 0.5, 3.0]])
     problem = Problem([*"a"]).add("position", "a", [1.0, 2, 3], cov=cov)
-    gap = np.array([1.0, -2.0, 0.5])
+    gap = array([1.0, -2.0, 0.5])
     assert problem.cost(gap[None] + [1, 2, 3]) == pytest.approx(0.5 * gap @ np.linalg.solve(cov, gap))
     assert solve(problem).covariance[0] == pytest.approx(cov)
 
@@ -161,9 +160,9 @@ def test_poses_without_an_x0_are_found(kind, of, d):
     problem = problem.add("relative_pose", [*pairwise(range(n))], moves, std=0.01)
     fixed = slice(of, None if of else n, 1 if of else 3)
     problem = problem.add("position", range(n + 4)[fixed], truth[fixed, :d], std=0.1)
-    gap = np.array([relative(space, truth, pair)[:d] for pair in pairs])
+    gap = array([relative(space, truth, pair)[:d] for pair in pairs])
     if lookup(kind).frame == "world":
-        gap = truth[n:, :d][np.arange(n) % 4] - truth[:n, :d]
+        gap = truth[n:, :d][arange(n) % 4] - truth[:n, :d]
     solution = solve(problem.add(kind, pairs, lookup(kind).predict(gap), std=0.02))
     assert solution.x[:, :d] == pytest.approx(truth[:, :d], abs=1e-3)
 
@@ -188,24 +187,24 @@ def test_offsets_that_ranges_share_are_scipys(backend):
     """Of two anchors, 2 and -0.4 m, with a point per step: minimum and covariance of a residual written here."""
     rng, steps = default_rng(4), 120
     path = np.cumsum(rng.normal(0.0, 2.0, (steps, 2)), axis=0)
-    anchors, which = np.array([[20.0, 5.0], [-8.0, 15.0]]), np.arange(steps) % 2
+    anchors, which = array([[20.0, 5.0], [-8.0, 15.0]]), arange(steps) % 2
     moved = np.diff(path, axis=0) + 0.05 * rng.normal(size=(steps - 1, 2))
     r = norm(anchors[which] - path, axis=1) + np.take([2.0, -0.4], which) + 0.1 * rng.normal(size=steps)
 
     def residual(u):
         x, offset = u[:-2].reshape(-1, 2), u[-2:]
         far = norm(anchors[which] - x, axis=1) + offset[which] - r
-        return np.concatenate([((np.diff(x, axis=0) - moved) / 0.05).ravel(), far / 0.1, offset / 3.0])
+        return concatenate([((np.diff(x, axis=0) - moved) / 0.05).ravel(), far / 0.1, offset / 3.0])
 
     theirs = least_squares(residual, np.append(path, [0.0, 0.0]), xtol=1e-14, gtol=1e-12)
     names = [*map(str, range(steps)), "A", "B", "offset A", "offset B"]
-    problem = Problem(names, x0=np.concatenate([path, anchors, np.zeros((2, 2))]), dimension=2, fixed=[*"AB"]).add(
+    problem = Problem(names, x0=concatenate([path, anchors, zeros((2, 2))]), dimension=2, fixed=[*"AB"]).add(
         "displacement", [*pairwise(names[:steps])], moved, 0.05
     )
     problem = problem.add(
         "range_offset", [(names[k], "AB"[k % 2], names[-2 + k % 2]) for k in range(steps)], r, std=0.1
     )
-    found = solve(problem.add("position", names[-2:], np.zeros((2, 2)), std=[3.0, 1.0]), backend)
+    found = solve(problem.add("position", names[-2:], zeros((2, 2)), std=[3.0, 1.0]), backend)
     assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
     assert found.x[-2:, 0] == pytest.approx(theirs.x[-2:], abs=1e-5)
     std = np.sqrt(np.diag(inv(theirs.jac.T @ theirs.jac))[-2:])
@@ -247,9 +246,9 @@ def test_half_a_turn_is_told_from_places_that_coincide():
 
 
 def test_an_antenna_stands_at_the_end_of_its_arm():
-    turn, at, arm = Rotation.from_rotvec([0.3, -0.2, 2.0]), np.array([5.0, 1.0, -2.0]), np.array([1.5, -0.6, 0.3])
-    x = np.stack([pose(at, turn.as_rotvec()), pose(arm, np.zeros(3))])
-    problem = Problem(("car", "arm"), x0=x, poses=["car"]).add("antenna", ("car", "arm"), np.zeros(3), std=1.0)
+    turn, at, arm = Rotation.from_rotvec([0.3, -0.2, 2.0]), array([5.0, 1.0, -2.0]), array([1.5, -0.6, 0.3])
+    x = np.stack([pose(at, turn.as_rotvec()), pose(arm, zeros(3))])
+    problem = Problem(("car", "arm"), x0=x, poses=["car"]).add("antenna", ("car", "arm"), zeros(3), std=1.0)
     assert problem.whiten(x)[0] == pytest.approx(at + turn.apply(arm))
 
 

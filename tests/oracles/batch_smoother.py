@@ -1,6 +1,7 @@
 """All positions of a drive as one dense least-squares problem, by Gauss-Newton to convergence."""
 
 import numpy as np
+from numpy import isfinite
 from numpy.linalg import inv, norm, solve
 
 from coopoc.world.links import spherical, to_vector, wrap
@@ -16,8 +17,8 @@ def batch_smoother(recording, noise_model, run, x):  # type: ignore[no-untyped-d
     )
     active = np.zeros(gnss.shape[:2], bool)
     for t, n in np.ndindex(active.shape):
-        began = (t > 0 and active[t - 1, n]) or np.isfinite(gnss[t, n]).all()
-        active[t, n] = np.isfinite(velocity[t, n]).all() and began
+        began = (t > 0 and active[t - 1, n]) or isfinite(gnss[t, n]).all()
+        active[t, n] = isfinite(velocity[t, n]).all() and began
     index = {key: 3 * k for k, key in enumerate(zip(*np.nonzero(active), strict=True))}
     size, eye = 3 * len(index), np.eye(3)
     x = np.where(active[..., None], x, np.nan)
@@ -33,7 +34,7 @@ def batch_smoother(recording, noise_model, run, x):  # type: ignore[no-untyped-d
                     A[at : at + 3, to : to + 3] += sign * also * W
 
         for t, n in index:
-            there = np.isfinite(gnss[t, n])
+            there = isfinite(gnss[t, n])
             W = np.diag(there / r[t, n])
             add([((t, n), 1.0)], W, W @ np.where(there, gnss[t, n] - x[t, n], 0.0))
             if (t - 1, n) in index:
@@ -67,7 +68,7 @@ def measurements(recording, run, active):  # type: ignore[no-untyped-def]
 def rows(vector, measured, sensors):  # type: ignore[no-untyped-def]
     """Whitened Jacobian and residual of what was measured of range, azimuth, inclination; without sensors, unit rows
     along the three axes of the measured direction."""
-    there, least = np.isfinite(measured), max(sensors.min_range, 0.1 * sensors.range_std) if sensors else 0.0
+    there, least = isfinite(measured), max(sensors.min_range, 0.1 * sensors.range_std) if sensors else 0.0
     measured = np.where(there, measured, np.array(spherical(*vector)))
     at = vector if sensors else to_vector(measured)
     J = slopes(at, least)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy import zeros
 
 from coopoc.arrays import Bools, Floats
 
@@ -20,7 +21,7 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
     import gtsam
 
     graph, nothing = gtsam.GaussianFactorGraph(), gtsam.VectorValues()
-    model, zero = gtsam.noiseModel.Unit.Create(1), np.zeros(1)
+    model, zero = gtsam.noiseModel.Unit.Create(1), zeros(1)
     for nodes, blocks in _groups(J, dof):
         if nodes.shape[1] == 1:
             for i, a in zip(nodes[:, 0].tolist(), blocks[:, 0], strict=True):
@@ -31,9 +32,9 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
     if still is not None:
         model = gtsam.noiseModel.Unit.Create(dof)
         for i in np.flatnonzero(still.any(1)).tolist():
-            graph.add(i, np.diag(still[i].astype(float)), np.zeros(dof), model)
+            graph.add(i, np.diag(still[i].astype(float)), zeros(dof), model)
     for i in range(n):
-        nothing.insert(i, np.zeros(dof))
+        nothing.insert(i, zeros(dof))
     try:
         tree = gtsam.Marginals(graph, nothing)
         return np.stack([tree.marginalCovariance(i) for i in range(n)])
@@ -51,7 +52,7 @@ def _groups(J: Any, dof: int) -> list[tuple[Any, Floats]]:
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
     arity = np.bincount(row[first], minlength=matrix.shape[0])
     where = np.cumsum(first) - 1
-    blocks = np.zeros((int(first.sum()), dof))
+    blocks = zeros((int(first.sum()), dof))
     blocks[where, matrix.indices % dof] = matrix.data
     nodes, owner = node[first], row[first]
     factors = []

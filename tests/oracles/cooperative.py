@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import nan
+from numpy import array, broadcast_to, diag, eye, full, isfinite, isnan, nan, outer, trace, where, zeros
 from numpy.linalg import norm, slogdet, solve
 
 from coopoc.arrays import Floats
@@ -75,7 +75,7 @@ class Belief:
 
     def __init__(self):
         self.names: list[Name] = []
-        self.x, self.p = np.zeros(0), np.zeros((0, 0))
+        self.x, self.p = zeros(0), zeros((0, 0))
 
     def at(self, *name):
         k = self.names.index(name)
@@ -83,17 +83,17 @@ class Belief:
 
     def add(self, name, mean, variance):
         n = len(self.x)
-        p = np.zeros((n + 3, n + 3))
-        p[:n, :n], p[n:, n:] = self.p, np.diag(np.broadcast_to(variance, 3))
+        p = zeros((n + 3, n + 3))
+        p[:n, :n], p[n:, n:] = self.p, diag(broadcast_to(variance, 3))
         self.names.append(name)
-        self.x, self.p = np.append(self.x, np.broadcast_to(mean, 3)), p
+        self.x, self.p = np.append(self.x, broadcast_to(mean, 3)), p
 
     def transform(self, name, terms):
         """The vector becomes a sum of others."""
-        f = np.eye(len(self.x))
+        f = eye(len(self.x))
         f[self.at(*name)] = 0
         for other, factor in terms.items():
-            f[self.at(*name), self.at(*other)] = factor * np.eye(3)
+            f[self.at(*name), self.at(*other)] = factor * eye(3)
         self.x, self.p = f @ self.x, f @ self.p @ f.T
 
     def drop(self, name):
@@ -105,11 +105,11 @@ class Belief:
 
     def noise(self, name, variance):
         at = self.at(*name)
-        self.p[at, at] += np.diag(np.broadcast_to(variance, 3))
+        self.p[at, at] += diag(broadcast_to(variance, 3))
 
     def row(self, terms, axis):
         """h of one number: a vector's factor is one for its axis, or three for its numbers."""
-        h = np.zeros(len(self.x))
+        h = zeros(len(self.x))
         for name, factor in terms.items():
             if np.ndim(factor):
                 h[self.at(*name)] = np.atleast_2d(factor)[axis if np.ndim(factor) == 2 else 0]
@@ -119,11 +119,11 @@ class Belief:
 
     def update(self, h, z, r, gate=0.0):
         """One number; its squared normalised innovation."""
-        return self.updates(h[None], np.array([z]), np.array([r]), gate)
+        return self.updates(h[None], array([z]), array([r]), gate)
 
     def updates(self, h, z, r, gate=0.0, share=1.0):
         """Several numbers with one gate, or a share of their information; their squared Mahalanobis distance."""
-        gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
+        gap, s = z - h @ self.x, h @ self.p @ h.T + diag(r)
         q = float(gap @ solve(s, gap))
         if gate and q > gate:
             s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
@@ -138,10 +138,10 @@ class Belief:
         if not some or odds == -inf:
             return
         p, m = self.p[np.ix_(some, some)], self.x[some]
-        prior = np.broadcast_to(prior, len(which))[[i in some for i in which]]
+        prior = broadcast_to(prior, len(which))[[i in some for i in which]]
         odds += 0.5 * (np.log(prior).sum() - slogdet(p)[1] - m @ solve(p, m))
         none, k = 1 / (1 + exp(min(-odds, 700))), solve(p, self.p[some]).T
-        self.x, self.p = self.x - none * k @ m, self.p - none * k @ (p - (1 - none) * np.outer(m, m)) @ k.T
+        self.x, self.p = self.x - none * k @ m, self.p - none * k @ (p - (1 - none) * outer(m, m)) @ k.T
 
 
 class Sent(NamedTuple):
@@ -174,11 +174,11 @@ class Life(NamedTuple):
 
 def fresh(gnss, moved, variance):
     """Fixes (T, N, 3) but those that repeat the last one of their receiver, whose vehicle has moved."""
-    new, last = gnss.copy(), np.full(gnss.shape[1:], nan)
+    new, last = gnss.copy(), full(gnss.shape[1:], nan)
     moves = np.square(moved).sum(-1) > 0.01 * variance[..., 0]
     for now, fix, goes in zip(new, gnss, moves, strict=True):
         now[goes & (fix == last).all(1)] = nan
-        last = np.where(np.isfinite(fix), fix, last)
+        last = where(isfinite(fix), fix, last)
     return new
 
 
@@ -186,21 +186,21 @@ class Oracle:
     """The filter of one ego in one run."""
 
     def __init__(self, seen, ego, run, known, priors):
-        s, measured, self.more = known.sensors, seen.velocity, np.zeros(len(seen.t))
+        s, measured, self.more = known.sensors, seen.velocity, zeros(len(seen.t))
         if priors.fix_gate:  # `test_odometry_fault` has what refers to that
             seen, fault = with_odometry(seen, [ego], known, priors.fix)
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
         self.dt, self.u = seen.dt, seen.velocity[run, :, ego]
-        self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), np.zeros(3), 1, np.zeros(6)), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0, 0, zeros(2), zeros(3), 1, zeros(6)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
             heading, bias = (float(v**2) for v in known.compass)
             self.std[1] = sqrt(self.std[1] ** 2 - heading - bias)
             keep = exp(-seen.dt / s.gnss_drift_time)
-            offset, absent = s.range_offset_std**2, np.full(6, priors.absent)
+            offset, absent = s.range_offset_std**2, full(6, priors.absent)
             absent[[2, 3, 5]] = max(priors.absent, 8.0)
             absent[3:5][[bias > 0, offset > 0]] = -inf
             bias, offset = bias or priors.compass**2, offset or priors.offset**2
@@ -211,7 +211,7 @@ class Oracle:
             )
             self.life = Life(*lasting, keep, bias, heading, offset, ranged, turn, holds, absent)
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
-        self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), seen.gnss.shape)[run]
+        self.r = priors.fix**2 * broadcast_to(known.fix_variance(seen), seen.gnss.shape)[run]
         gnss = fresh(seen.gnss[run], seen.dt * seen.velocity[run], self.r)
         self.fix = gnss[:, ego]
         self.remember(gnss, seen.velocity[run])
@@ -223,18 +223,18 @@ class Oracle:
 
     def remember(self, gnss, velocity):
         """What every vehicle sends: a mean of its fixes, each of which fades with its age."""
-        self.mean, self.weight, self.odometer = (np.zeros(gnss.shape) for _ in range(3))
-        m, w, o = np.zeros((3, *gnss.shape[1:]))
+        self.mean, self.weight, self.odometer = (zeros(gnss.shape) for _ in range(3))
+        m, w, o = zeros((3, *gnss.shape[1:]))
         for t, (z, u) in enumerate(zip(gnss, velocity, strict=True)):
-            moved, there = np.nan_to_num(self.dt * u), np.isfinite(z)
-            w = np.where(np.isnan(u), 0.0, w * exp(-self.dt / FADES)) + there / self.r[t]
+            moved, there = np.nan_to_num(self.dt * u), isfinite(z)
+            w = where(isnan(u), 0.0, w * exp(-self.dt / FADES)) + there / self.r[t]
             m, o = m + moved, o + moved
-            m = np.where(there, m + (z - m) / np.where(there, self.r[t] * w, 1.0), m)
+            m = where(there, m + (z - m) / where(there, self.r[t] * w, 1.0), m)
             self.mean[t], self.weight[t], self.odometer[t] = m, w, o
 
     def reset(self):
         self.state, self.lone = self.blank(), None
-        self.doubts, self.left, self.last, self.pending, self.alike = np.zeros(2), 0.0, 0.0, 0.0, 0.0
+        self.doubts, self.left, self.last, self.pending, self.alike = zeros(2), 0.0, 0.0, 0.0, 0.0
 
     def blank(self):
         tables = (
@@ -268,8 +268,8 @@ class Oracle:
         return SimpleNamespace(
             **{name: {} for name in tables},
             **dict.fromkeys((*numbers, "score", "numbers", "squares", "late", "weight", "unsaid", "whole"), 0.0),
-            **{name: np.zeros(6) for name in ("level", "learned", "information")},
-            **{name: np.zeros(3) for name in ("gap", "cov", "off", "course", "recent")},
+            **{name: zeros(6) for name in ("level", "learned", "information")},
+            **{name: zeros(3) for name in ("gap", "cov", "off", "course", "recent")},
             **dict.fromkeys(("left", "unused")),
             **{name: [] for name in ("products", "votes", "members")},
             belief=Belief(),
@@ -284,9 +284,9 @@ class Oracle:
         for t in range(len(self.seen.t)):
             fix, u = self.fix[t], self.u[t]
             self.gather(t)
-            if np.isnan(u[0]) or not (self.state.belief.names or self.places(t, fix)):
+            if isnan(u[0]) or not (self.state.belief.names or self.places(t, fix)):
                 self.reset()
-                found.append((np.full(3, nan), np.full((3, 3), nan), []))
+                found.append((full(3, nan), full((3, 3), nan), []))
                 continue
             if not self.state.belief.names:
                 self.begin(t)
@@ -296,16 +296,16 @@ class Oracle:
             self.remember_error(t)
             x, cov = self.compare(t, *self.answer())
             cov = cov * (1 + self.state.unsaid / self.state.whole)
-            more, white = max(self.lasting(t) - np.trace(cov), self.others()), self.r[t, self.ego] * self.white
-            here = x, cov + more * np.diag(white / white.sum())
+            more, white = max(self.lasting(t) - trace(cov), self.others()), self.r[t, self.ego] * self.white
+            here = x, cov + more * diag(white / white.sum())
             b, way = self.state.belief, self.state.way
             errors = [b.x[b.at("b", j)] for j in {self.ego, *self.state.members} - self.state.trusted]
             if self.priors.forget and self.trusted() + (self.ego in self.state.trusted) < 2:
-                here[1][:] += sum(map(np.outer, errors, errors)) / 2
-            at = [b.x[b.at("x", j)] + way[j] if j in way else np.full(3, nan) for j in self.neighbours(t)[1]]
+                here[1][:] += sum(map(outer, errors, errors)) / 2
+            at = [b.x[b.at("x", j)] + way[j] if j in way else full(3, nan) for j in self.neighbours(t)[1]]
             found.append((*here, at))
-        neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
-        return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
+        neighbours = [array(o).reshape(-1, 3) for *_, o in found]
+        return array([x for x, *_ in found]), array([p for _, p, _ in found]), neighbours
 
     def remember_error(self, t):
         s, b = self.state, self.state.belief
@@ -320,7 +320,7 @@ class Oracle:
     def lasting(self, t):
         if not (self.priors.forget and self.state.products):
             return 0.0
-        when, p = np.array(self.state.products).T
+        when, p = array(self.state.products).T
         w, seconds = np.exp(-(t - when) * self.dt / 100), (t - self.state.began) * self.dt
         n = max(w.sum(), 1.0)
         c, error = w @ p / n, w @ p**2 / n * max(2 / np.clip(seconds, 1, 100), 1 / n)
@@ -334,7 +334,7 @@ class Oracle:
         b = copy.deepcopy(self.state.belief)
         self.average(b)
         x = b.at("x", self.ego)
-        self.state.cov, self.state.off = np.diag(b.p[x, x]), b.x[x] - self.state.belief.x[x]
+        self.state.cov, self.state.off = diag(b.p[x, x]), b.x[x] - self.state.belief.x[x]
         return b.x[x], b.p[x, x]
 
     def compare(self, t, x, cov):
@@ -343,7 +343,7 @@ class Oracle:
             return x, cov
         fix, dt, before = self.fix[t], self.dt, self.state
         if self.state.unused == t:
-            fix = np.full(3, nan)
+            fix = full(3, nan)
         level = max(self.state.level[:3])
         self.state, self.deaf = self.lone, True
         self.pace(t)
@@ -353,16 +353,16 @@ class Oracle:
         y, q = self.answer()
         self.lone, self.state, self.deaf = self.state, before, False
         self.left -= dt
-        if np.isfinite(fix).all():
+        if isfinite(fix).all():
             r = self.r[t, self.ego] * self.white + self.life.own + self.life.common
-            star, lone = (min(((fix - at) ** 2 / (r + np.diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
+            star, lone = (min(((fix - at) ** 2 / (r + diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
             self.doubts = exp(-dt / 10) * self.doubts + [star - lone, 1]
             self.gather(t)
             star, lone = (sum(self.off(t, at)) for at in (x, y))
             self.alike = exp(-dt / 10) * self.alike + star - lone
             if (level > 2.9 or self.alike > 20) and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
                 self.state = copy.deepcopy(self.lone)
-                self.doubts, self.last, self.alike = np.zeros(2), max(2 * self.last, 20.0), 0.0
+                self.doubts, self.last, self.alike = zeros(2), max(2 * self.last, 20.0), 0.0
                 self.left = self.last
         return (y, q) if self.left > 0 else (x, cov)
 
@@ -446,9 +446,9 @@ class Oracle:
 
     def places(self, t, fix):
         """Where the ego may be, and the variance: by its fix, and by each neighbour."""
-        found = [(fix.copy(), self.r[t, self.ego])] if np.isfinite(fix).all() else []
+        found = [(fix.copy(), self.r[t, self.ego])] if isfinite(fix).all() else []
         for j, message in self.messages.items():
-            if message is not None and np.isfinite(self.relative[j]).all() and message.weight.all():
+            if message is not None and isfinite(self.relative[j]).all() and message.weight.all():
                 late = (t - message.step) * self.dt * message.velocity
                 found.append((message.mean + late - to_vector(self.relative[j]), 1 / message.weight + 1))
         return found
@@ -473,7 +473,7 @@ class Oracle:
         self.state.information[kind] += 0.5 * numbers * share**2
 
     def own_variance(self):
-        return np.diag(self.state.belief.p)[self.state.belief.at("x", self.ego)].sum()
+        return diag(self.state.belief.p)[self.state.belief.at("x", self.ego)].sum()
 
     def corrected(self):
         """What the level of motion makes of the ego's variance, after an update."""
@@ -506,7 +506,7 @@ class Oracle:
         fix = self.fix[t].copy()
         if s.unused == t:
             fix[:] = nan
-        seen, outvoted = bool(np.isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix)
+        seen, outvoted = bool(isfinite(fix).all()), bool(g.fix_gate) and self.outvoted(t, fix)
         if outvoted:
             s.trusted.add(self.ego)
         again = bool(g.fix_gate) and t > s.began and seen
@@ -528,7 +528,7 @@ class Oracle:
             x = b.at("x", self.ego)
             across = min(SIDEWAYS + (TURNS * s.blind) ** 2, 1.0)
             widened = min(slip, LEFT_OPEN * self.grown) if self.corrected_now else slip
-            b.p[x, x] += widened * (across * np.eye(3) + np.outer(s.course, s.course))
+            b.p[x, x] += widened * (across * eye(3) + outer(s.course, s.course))
         s.made = s.made + q.sum()
         grown, way = max(0.0 if self.ego in s.vague else self.own_variance() - s.whole, q.sum()), 0.0
         s.cov = s.cov + (grown / 3 if slip else q)
@@ -541,15 +541,15 @@ class Oracle:
         s.whole = self.own_variance()
         for j in [j for j in others if j not in s.members]:
             self.join(t, j)
-        if np.isfinite(fix).all():
+        if isfinite(fix).all():
             self.add_fix(t, fix)
         for j in self.nearest()[1]:
             new = j in s.vague and messages[j] is not None
-            if new and g.fix_gate and np.isfinite(relative[j]).all():
+            if new and g.fix_gate and isfinite(relative[j]).all():
                 s.way[j] = self.goes_on(t, j)[0]
             else:
                 self.take(t, j)
-                if new and g.fix_gate and np.isfinite(relative[j][1]):
+                if new and g.fix_gate and isfinite(relative[j][1]):
                     self.trust()
         at, order = self.nearest()
         self.measure(t, at, order)
@@ -567,7 +567,7 @@ class Oracle:
                 fixes = (changes[3] + n * changes[4]) / (1 + n)
                 made = min(s.made, s.whole + s.unsaid)
                 s.unsaid += made * changes[5] + (s.whole + s.unsaid - made) * fixes
-        s.learned = np.zeros(6)
+        s.learned = zeros(6)
         s.information = s.information * (exp(-dt / g.forget) if g.forget else 1.0)
 
     def nearest(self):
@@ -604,7 +604,7 @@ class Oracle:
 
     def keep_place(self, more):
         s, b, at = self.state, self.state.belief, self.state.belief.at("x", self.ego)
-        s.left = b.x[at].copy(), (np.trace(b.p[at, at]) + more) / 3
+        s.left = b.x[at].copy(), (trace(b.p[at, at]) + more) / 3
         s.evidence = s.agree = s.driven = 0.0
 
     def go_back(self, t, fix, rows):
@@ -612,7 +612,7 @@ class Oracle:
         s, b = self.state, self.state.belief
         q, gap, cov, r = self.mahalanobis(b, rows)
         gate, at = max(self.priors.fix_gate, FIX_GATE), b.at("x", self.ego)
-        gain = 0.0 if s.now else float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
+        gain = 0.0 if s.now else float(np.mean(diag(cov) / (diag(cov) + r)))
         s.agree = 0.0 if q > gate else s.agree + gain
         if not s.left:
             if q > gate:
@@ -620,23 +620,23 @@ class Oracle:
             return
         (x, p), most = s.left, HARD_REJECT_FACTOR * gate
         if ("o", self.ego) in b.names and self.life.absent[0] == -inf:
-            p += s.driven**2 * np.diag(b.p)[b.at("o", self.ego)].sum() / 3
+            p += s.driven**2 * diag(b.p)[b.at("o", self.ego)].sum() / 3
         other = ((fix - x) ** 2 / (p + r + SLIP_M2)).sum()
         s.evidence = 0.0 if other > gate else max(s.evidence + min(q, most) - other, 0.0)
-        near = np.square(b.x[at] - x + np.diag(cov) / (np.diag(cov) + r) * gap).sum() < 3 * p
+        near = np.square(b.x[at] - x + diag(cov) / (diag(cov) + r) * gap).sum() < 3 * p
         if not near and s.evidence > FIXES_TO_RETURN * most:
             if self.speak_for(t, b.x[at], x) > 0:
                 return
             for j in list(s.members):
                 self.dismiss(j, j in self.messages, False)
             self.place(x, p)
-            s.left, s.cov, s.off = None, np.full(3, p), np.zeros(3)
+            s.left, s.cov, s.off = None, full(3, p), zeros(3)
         elif near and s.agree > AWAY:
             s.left = None
 
     def learn_fix(self, kind, rows):
         _, gap, cov, r = self.mahalanobis(self.state.belief, rows)
-        total, s = np.trace(cov) + r.sum(), self.state
+        total, s = trace(cov) + r.sum(), self.state
         change, square = np.square(gap - s.gap).sum() / 2 / total, gap @ gap / total
         wild, established = square > SUDDEN, s.agreed >= ESTABLISHED and s.locked.get(self.ego, 0.0) >= MAX_LOCKOUT
         noise = change if kind == 3 and wild and not established else square
@@ -646,10 +646,10 @@ class Oracle:
 
     def mahalanobis(self, b, rows):
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
-        h = np.array([b.row(row[0], c) for c, row in enumerate(rows)])
-        gap, r = np.array([row[1] for row in rows]) - h @ b.x, np.array([row[2] for row in rows])
+        h = array([b.row(row[0], c) for c, row in enumerate(rows)])
+        gap, r = array([row[1] for row in rows]) - h @ b.x, array([row[2] for row in rows])
         cov = h @ b.p @ h.T
-        return float(gap @ solve(cov + np.diag(r), gap)), gap, cov, r
+        return float(gap @ solve(cov + diag(r), gap)), gap, cov, r
 
     def may_slip(self, fix, way2):
         return min(SLIP_M2, max(float(np.mean(fix)), 0.25 * way2))
@@ -664,8 +664,8 @@ class Oracle:
         """That share, the less, the more in a row were rejected; trust may be revoked."""
         s, g, b = self.state, self.priors, self.state.belief
         used = [c for c, row in enumerate(rows) if row is not None]
-        h = np.array([b.row(rows[c][0], c) for c in used])
-        z, r = (np.array([rows[c][i] for c in used]) for i in (1, 2))
+        h = array([b.row(rows[c][0], c) for c in used])
+        z, r = (array([rows[c][i] for c in used]) for i in (1, 2))
         if not used:
             return 1.0
         if j in s.vague and len(used) == 3:
@@ -684,13 +684,13 @@ class Oracle:
             self.doubt(j, TAU if supported else 0.0)
             if j == self.ego:
                 s.locked[j] = 0.0
-                h = np.array([b.row(self.fix_terms(j), c) for c in used])
+                h = array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0 if supported else 1.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
-        square = float(gap @ solve(own + np.diag(r), gap))
-        self.count(min(square, FIX_SCORE), slogdet(own + np.diag(r))[1], len(used))
-        mine, noise, locked = np.trace(own), r.sum(), s.locked
+        square = float(gap @ solve(own + diag(r), gap))
+        self.count(min(square, FIX_SCORE), slogdet(own + diag(r))[1], len(used))
+        mine, noise, locked = trace(own), r.sum(), s.locked
         if not judged:
             mine, noise = s.cov[used].sum(), noise * exp(-s.level[3])
         gain = mine / (mine + noise)
@@ -723,18 +723,18 @@ class Oracle:
     def wrong_on_average(self, j, q, gap, cov, r):
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
         s, g = self.state, self.priors
-        count, mean, noise = s.mean.get(j, (0.0, np.zeros(3), 0.0))
+        count, mean, noise = s.mean.get(j, (0.0, zeros(3), 0.0))
         count = min(count + 1, WINDOW)
         s.mean[j] = count, mean, noise
         if j not in s.trusted and q > max(g.fix_gate, FIX_GATE):
             return True
         mean = mean + (gap * min(1.0, sqrt(CLIP / q)) - mean) / count
         s.mean[j] = count, mean, noise + (r.sum() - noise) / count
-        v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
+        v = cov + diag(r) / count + (1.0 if self.life.own else 0.0) * eye(3)
         near = mean @ solve(v, mean)
         enough = near >= 2 * (log((1 - FAULTY_SHARE) / FAULTY_SHARE) + REVOKE_LOG_ODDS)
-        v = v + (self.usual(j) if j != self.ego else 0.0) * np.eye(3)
-        wide = v + min(TAU**2, mean @ mean / 3) * np.eye(3)
+        v = v + (self.usual(j) if j != self.ego else 0.0) * eye(3)
+        wide = v + min(TAU**2, mean @ mean / 3) * eye(3)
         odds = log((1 - FAULTY_SHARE) / FAULTY_SHARE) + normal(mean, v) - normal(mean, wide)
         return bool(count >= LEAST and enough and odds < -REVOKE_LOG_ODDS)
 
@@ -744,12 +744,12 @@ class Oracle:
         s, b, errors = self.state, self.state.belief, list[Any]()
         for j in (self.ego, *(j for j in s.members if j in s.last)):
             if j != but and j not in s.trusted:
-                errors.append((b.x[b.at("b", j)], np.trace(b.p[b.at("b", j), b.at("b", j)])))
+                errors.append((b.x[b.at("b", j)], trace(b.p[b.at("b", j), b.at("b", j)])))
             elif j != but and j in s.mean and s.mean[j][0] >= 3:
                 errors.append((s.mean[j][1], s.mean[j][2] / s.mean[j][0]))
         if len(errors) < 3:
             return 0.0
-        apart = np.array([[((x - y) ** 2).sum() - p - q for y, q in errors] for x, p in errors])
+        apart = array([[((x - y) ** 2).sum() - p - q for y, q in errors] for x, p in errors])
         np.fill_diagonal(apart, inf)
         return float(np.sort(apart.min(1))[(len(errors) - 1) // 2].clip(0) / 3)
 
@@ -773,7 +773,7 @@ class Oracle:
             """From one another, or from 0."""
             at, to = b.at("b", j), b.at("b", j if k is None else k)
             two, cross = float(k is not None), b.p[at, to]
-            v = b.p[at, at] + two * (b.p[to, to] - cross - cross.T) + 1e-6 * np.eye(3)
+            v = b.p[at, at] + two * (b.p[to, to] - cross - cross.T) + 1e-6 * eye(3)
             gap = b.x[at] - two * b.x[to]
             return float(gap @ solve(v, gap))
 
@@ -787,7 +787,7 @@ class Oracle:
         if len(alike[best]) <= self.trusted() + 1 if own else 2 * len(alike[best]) <= len(heard):
             return
         x, e = b.at("x", self.ego), b.at("b", best)
-        there, variance = b.x[x] + b.x[e], np.trace(b.p[x, x] + b.p[e, e] + 2 * b.p[x, e])
+        there, variance = b.x[x] + b.x[e], trace(b.p[x, x] + b.p[e, e] + 2 * b.p[x, e])
         if own and norm(b.x[e]) > s.shown + 2 * sqrt(variance):
             return
         before = [self.ego, *s.members]
@@ -807,7 +807,7 @@ class Oracle:
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
-        elsewhere = np.isnan(fix[0]) or (votes[0] <= 1 and max(votes) >= 2)
+        elsewhere = isnan(fix[0]) or (votes[0] <= 1 and max(votes) >= 2)
         if self.ego not in s.trusted and votes[0] < max(len(votes), 2):
             return False
         self.place(places[best if elsewhere else 0][0], FLAT)
@@ -843,7 +843,7 @@ class Oracle:
         for at in votes:
             at[0] += self.dt * u
         self.state.spread = self.state.spread + q.mean() if votes else 0.0
-        if np.isnan(fix).any():
+        if isnan(fix).any():
             return False
         for at in votes:
             if ((fix - at[0]) ** 2 / (2 * r + self.state.spread + SLIP_M2)).sum() <= HARD_REJECT_FACTOR * FIX_GATE:
@@ -866,14 +866,14 @@ class Oracle:
         std, found = self.std * np.exp(self.state.level[:3] / 2), []
         for j, message in self.messages.items():
             relative = self.relative[j]
-            if message is None or np.isnan(relative[0]):
+            if message is None or isnan(relative[0]):
                 continue
             with np.errstate(divide="ignore"):
                 r = np.mean(1 / message.weight + self.r[t, self.ego] * self.white + 1) + std[0] ** 2
                 r += self.life.own + self.life.common
             gap = message.mean + (t - message.step) * self.dt * message.velocity - place
             q = (norm(gap) - relative[0]) ** 2 / r
-            if np.isfinite(relative).all():
+            if isfinite(relative).all():
                 q = np.square(gap - to_vector(relative)).sum() / (r + std[1] ** 2 * gap @ gap)
             found.append(min(float(q), FIX_GATE))
         return found
@@ -916,8 +916,8 @@ class Oracle:
             self.state.pace[j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2
         if g.fix_gate and since >= 0:
-            cross, square = exp(-passed / TURN_MEMORY_S) * self.state.bends.get(j, np.zeros(2))
-            self.state.bends[j] = np.array([cross + last[0] * u[1] - last[1] * u[0], square + passed * u[:2] @ u[:2]])
+            cross, square = exp(-passed / TURN_MEMORY_S) * self.state.bends.get(j, zeros(2))
+            self.state.bends[j] = array([cross + last[0] * u[1] - last[1] * u[0], square + passed * u[:2] @ u[:2]])
         self.state.pace[j] = u, t, q, 0
         return u, q
 
@@ -949,12 +949,12 @@ class Oracle:
 
     def turned(self, j, moved):
         """A motion by odometry, corrected, and its derivatives by the errors of it."""
-        b, by = self.state.belief, np.zeros((3, 3))
+        b, by = self.state.belief, zeros((3, 3))
         if ("o", j) not in b.names or (j == self.ego and self.corrected_now):
             return moved, by
         turn, scale, _ = self.turn(j)
         c, s = cos(turn), sin(turn)
-        way = (1 + scale) * np.array([[c, -s], [s, c]]) @ moved[:2]
+        way = (1 + scale) * array([[c, -s], [s, c]]) @ moved[:2]
         by[:2, 0], by[:2, 1] = [-way[1], way[0]], way / (1 + scale)
         return np.append(way, moved[2]), by
 
@@ -966,9 +966,9 @@ class Oracle:
             self.state.driven += hypot(way[0], way[1])
         if ("o", j) not in b.names:
             return
-        x, o, f, level = b.at("x", j), b.at("o", j), np.eye(len(b.x)), exp(self.state.level[5])
+        x, o, f, level = b.at("x", j), b.at("o", j), eye(len(b.x)), exp(self.state.level[5])
         holds = self.life.holds ** (level**2 * steps)
-        f[x, o], f[o, o] = by, holds * np.eye(3)
+        f[x, o], f[o, o] = by, holds * eye(3)
         b.p = f @ b.p @ f.T
         b.x[o] *= holds
         b.noise(("o", j), (1 - holds**2) * self.life.turn)
@@ -976,8 +976,8 @@ class Oracle:
     def near(self, j):
         """Where the ego measures a vehicle."""
         b, relative = self.state.belief, self.relative[j]
-        far = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
-        gap = to_vector(relative) if np.isfinite(relative).all() else np.array([far, far, 0.1 * far])
+        far = 1 + (0.0 if isnan(relative[0]) else relative[0])
+        gap = to_vector(relative) if isfinite(relative).all() else array([far, far, 0.1 * far])
         near: Floats = b.x[b.at("x", self.ego)] + gap
         return near
 
@@ -1013,24 +1013,24 @@ class Oracle:
 
     def relate(self, t, j, at):
         relative, message = self.relative[j], self.messages[j]
-        s, g, there = self.state, self.priors, np.isfinite(relative)
+        s, g, there = self.state, self.priors, isfinite(relative)
         b, vague, hits = s.belief, j in s.vague, s.hits[("relative", j)]
         if not there.all() and vague:
             return
         gap, unit = at[j] - at[self.ego], self.known.sensors is None
-        expected = np.array(spherical(*gap))
+        expected = array(spherical(*gap))
         far = expected[0]
         ground, least = hypot(gap[0], gap[1]), 0.0 if unit else self.known.sensors.min_range  # type: ignore[union-attr]
         reach = max(far, least)
         flat = max(ground / far, 1e-3) * reach
-        rows = np.array(
+        rows = array(
             [
                 gap / far,
                 [-gap[1] / flat**2, gap[0] / flat**2, 0],
                 [gap[0] * gap[2] / (flat * reach**2), gap[1] * gap[2] / (flat * reach**2), -flat / reach**2],
             ]
         )
-        residual, size = relative - expected, np.array([1.0, flat, reach])
+        residual, size = relative - expected, array([1.0, flat, reach])
         residual[1:] = wrap(residual[1:])
         z, r = residual + rows @ gap, 1 / size**2 if unit else self.std**2
         r, age = r * np.exp(s.level[:3]), (t - s.since[j]) * self.dt
@@ -1045,16 +1045,16 @@ class Oracle:
                 terms[("o", j)] = rows[c] @ by
                 z[c] += rows[c] @ by @ self.turn(j)
             if c < 2 and ("compass",) in b.names:
-                terms[("compass",)] = np.array([[0, 0, 1], [1, 1, 0]][c])
+                terms[("compass",)] = array([[0, 0, 1], [1, 1, 0]][c])
             for who, factor in ((self.ego, far), (j, 1.0)):
                 if c == 0 and ("r", who) in b.names:
-                    terms[("r", who)] = np.array([factor, 0, 0])
+                    terms[("r", who)] = array([factor, 0, 0])
             h.append(b.row(terms, c))
         spread = np.einsum("ci,ij,cj->c", h, b.p, h)
         if g.fix_gate and not vague:  # the variance of terms of second order, with what each number leaves of its error
             p, own = spread * size**2, r * size**2
-            u, v, w = np.where(there, p * own / (p + own), p)
-            r = r + np.array([0.5 * (v**2 + w**2), u * p[1], u * p[2]]) / (reach * size) ** 2
+            u, v, w = where(there, p * own / (p + own), p)
+            r = r + array([0.5 * (v**2 + w**2), u * p[1], u * p[2]]) / (reach * size) ** 2
         total = spread + r
         for c in np.flatnonzero(there):
             logdet = log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
@@ -1115,14 +1115,14 @@ class Oracle:
             way = long * max(0, 1 - 1 / n)
         terms: dict[Name, Any] = dict(self.fix_terms(j))
         if ("o", j) in self.state.belief.names:  # by a clock that is ahead
-            terms["o", j] = np.outer(-new.velocity, [0, 0, 1])
+            terms["o", j] = outer(-new.velocity, [0, 0, 1])
         return terms, z, white + way * q[c]
 
     def goes_on(self, t, j):
         """The way since the newest message, and its derivatives by the errors of odometry."""
         message, (*_, slips) = self.messages[j], self.state.pace.get(j, [0])
         age = (t - self.state.since[j]) * self.dt
-        u = np.zeros(3) if message is None else self.state.pace[j][0] if slips else message.velocity
+        u = zeros(3) if message is None else self.state.pace[j][0] if slips else message.velocity
         if message and j in self.state.bends and not slips:
             cross, square = self.state.bends[j]
             signal, noise = (
@@ -1130,7 +1130,7 @@ class Oracle:
                 message.process[:2].mean() / (self.dt * TURN_MEMORY_S) ** 2,
             )
             a = (age + self.dt) / 2 * cross / square * max(0.0, 1 - noise / (signal + 1e-12))
-            u = np.array([cos(a) * u[0] - sin(a) * u[1], sin(a) * u[0] + cos(a) * u[1], u[2]])
+            u = array([cos(a) * u[0] - sin(a) * u[1], sin(a) * u[0] + cos(a) * u[1], u[2]])
         return self.turned(j, age * u)
 
     def trust(self):
@@ -1147,7 +1147,7 @@ class Oracle:
                 odds[j] = log((1 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * s.revoked.get(j, 0)
                 own = min(self.life.own + self.usual(j), wide / 2)
                 narrow[j] = own * wide / (wide - own)
-                odds[j] += normal(x, narrow[j] * np.eye(3) + p) - normal(0 * x, wide * wide / (wide - own) * np.eye(3))
+                odds[j] += normal(x, narrow[j] * eye(3) + p) - normal(0 * x, wide * wide / (wide - own) * eye(3))
             best = max(odds, key=lambda j: (odds[j], -s.slot[j]), default=-1)
             if best < 0 or odds[best] <= TRUST_LOG_ODDS:
                 return

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy import array, diag, isfinite, zeros
 from numpy.linalg import inv, solve
 
 from coopoc import NoiseModel
@@ -19,51 +20,51 @@ from oracles.messages import Member, directions, slopes
 
 def follow(stars: list[list[Member]], updated: Callable[..., Any]) -> tuple[Floats, Floats, list[Floats]]:
     """x (T, 3), covariance (T, 3, 3) and the neighbours (k, 3) at each step."""
-    x, p, estimates = np.zeros((0, 3)), np.zeros((0, 0)), []
+    x, p, estimates = zeros((0, 3)), zeros((0, 0)), []
     for star in stars:
         x, p = updated(*predict(x, p, star), star)
         estimates.append((x, p[:3, :3]))
     xs, covariances = zip(*estimates, strict=True)
-    return np.array([x[0] for x in xs]), np.array(covariances), [x[1:] for x in xs]
+    return array([x[0] for x in xs]), array(covariances), [x[1:] for x in xs]
 
 
 def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
     """Members that stay move; a member that joins is where the ego measures it, with a flat prior."""
     n, m = len(star), len(x)
-    new = np.zeros((n, 3))
+    new = zeros((n, 3))
     q = np.concatenate([np.full(3, FORGOTTEN) if member.before is None else member.process for member in star])
-    pick = np.zeros((3 * n, 3 * m))
+    pick = zeros((3 * n, 3 * m))
     for k, member in enumerate(star):
         if member.before is not None:
             pick[3 * k : 3 * k + 3, 3 * member.before : 3 * member.before + 3] = np.eye(3)
             new[k] = x[member.before] + member.moved
         else:
             new[k] = member.position if k == 0 else first_place(member, new[0])
-    return new, pick @ p @ pick.T + np.diag(q)
+    return new, pick @ p @ pick.T + diag(q)
 
 
 def first_place(member: Member, ego: Floats) -> Floats:
     """As measured; if a component is missing, as broadcast; without a fix somewhere near."""
-    if np.isfinite(member.relative).all():
+    if isfinite(member.relative).all():
         return ego + to_vector(member.relative)
     if member.new:
-        return np.array(member.position)
-    return ego + np.array([1.0, 1.0, 0.1]) * (1.0 + (0.0 if np.isnan(member.relative[0]) else member.relative[0]))
+        return array(member.position)
+    return ego + array([1.0, 1.0, 0.1]) * (1.0 + (0.0 if np.isnan(member.relative[0]) else member.relative[0]))
 
 
 def placed(member: Member, information: Floats) -> bool:
     """Whether an incomplete measurement has a known geometry: 1e-4 /m^2 and more along x."""
-    return bool(np.isfinite(member.relative).all() or information > 1e-4)
+    return bool(isfinite(member.relative).all() or information > 1e-4)
 
 
 def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats]:
     """Fixes and converted vectors at the predicted geometry; then one exact step."""
     n = len(star)
-    information, eta = inv(p), np.zeros(3 * n)
+    information, eta = inv(p), zeros(3 * n)
     for k, member in enumerate(star):
         if member.new:
             at = slice(3 * k, 3 * k + 3)
-            information[at, at] += np.diag(1 / member.variance)
+            information[at, at] += diag(1 / member.variance)
             eta[at] += (member.position - x[k]) / member.variance
     linear, linear_eta = information.copy(), eta.copy()
     used = [k for k in range(1, n) if placed(star[k], information[3 * k, 3 * k])]
@@ -84,7 +85,7 @@ def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel, ex
 
 def add(information: Floats, eta: Floats, k: int, weight: Floats, push: Floats) -> None:
     """Information about x_k - x_0."""
-    b = np.zeros((3, len(eta)))
+    b = zeros((3, len(eta)))
     b[:, 3 * k : 3 * k + 3], b[:, :3] = np.eye(3), -np.eye(3)
     information += b.T @ weight @ b
     eta += b.T @ push
@@ -93,18 +94,18 @@ def add(information: Floats, eta: Floats, k: int, weight: Floats, push: Floats) 
 def converted(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[Floats, Floats, Floats]:
     """Unit directions of range, azimuth and inclination (rows) at `gap`, their information, and the converted vector
     less `gap` along them; a missing component has no row."""
-    there = np.isfinite(relative)
-    expected = np.array(spherical(*gap))
+    there = isfinite(relative)
+    expected = array(spherical(*gap))
     measured = np.where(there, relative, expected)
     rows = directions(*expected[1:])
     cov = rows @ np.atleast_2d(noise_model.relative_cov(expected)) @ rows.T
-    return rows[there], np.diag(1 / np.diag(cov)[there]), rows[there] @ (to_vector(measured) - gap)
+    return rows[there], diag(1 / diag(cov)[there]), rows[there] @ (to_vector(measured) - gap)
 
 
 def whitened(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[Floats, Floats]:
     """Jacobian and residual of what was measured, in standard deviations."""
     assert noise_model.sensors is not None
-    residual = relative - np.array(spherical(*gap))
+    residual = relative - array(spherical(*gap))
     residual[1:] = wrap(residual[1:])
-    there, std = np.isfinite(relative), noise_model.sensors.relative_std
+    there, std = isfinite(relative), noise_model.sensors.relative_std
     return (slopes(gap, noise_model.sensors.min_range) / std[:, None])[there], (residual / std)[there]

@@ -5,6 +5,7 @@ vectors. A member whose measurement is incomplete has no edge.
 """
 
 import numpy as np
+from numpy import eye
 from numpy.linalg import inv
 
 from coopoc import NoiseModel
@@ -17,7 +18,7 @@ def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel) ->
     """P^-1 += L W L + diag(1/r)."""
     n = len(star)
     edges = [k for k in range(1, n) if np.isfinite(star[k].relative).all()]
-    incidence = (np.eye(n) - np.eye(1, n).T)[:, edges]
+    incidence = (eye(n) - eye(1, n).T)[:, edges]
     laplacian, variance = incidence @ incidence.T, np.ones(n)
     delta = incidence @ np.reshape([to_vector(star[k].relative) for k in edges], (-1, 3))
     if noise_model.sensors is not None and edges:
@@ -25,7 +26,7 @@ def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel) ->
         variance = np.maximum(np.diag(laplacian), 1.0) * mean
     fixes = [1 / member.variance if member.new else np.zeros(3) for member in star]
     weight = np.concatenate([np.repeat(1 / variance, 3), *fixes])
-    h = np.kron(np.vstack([laplacian, np.eye(n)]), np.eye(3))
+    h = np.kron(np.vstack([laplacian, eye(n)]), eye(3))
     z = np.concatenate([delta, [member.position for member in star]]).ravel()
     p = inv(inv(p) + h.T * weight @ h)
     return x + (p @ h.T @ (weight * (z - h @ x.ravel()))).reshape(-1, 3), p

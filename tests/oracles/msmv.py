@@ -1,6 +1,7 @@
 """MSMV-R, one run: P^-1 = P_prior^-1 + C_p^-1 + sum_j C_j^-1, each neighbour a pseudo-fix y_j = p_j - rho(r_ij)."""
 
 import numpy as np
+from numpy import zeros
 from numpy.linalg import inv, solve
 
 from coopoc import NoiseModel
@@ -12,7 +13,7 @@ from oracles.messages import Member
 
 def follow(stars: list[list[Member]], noise_model: NoiseModel) -> tuple[Floats, Floats]:
     """x (T, 3) and covariance (T, 3, 3); a position in a message is the sender's own estimate."""
-    x, p, estimates = np.zeros(3), np.zeros((3, 3)), []
+    x, p, estimates = zeros(3), zeros((3, 3)), []
     for star in stars:
         ego = star[0]
         x, p = (
@@ -27,8 +28,8 @@ def follow(stars: list[list[Member]], noise_model: NoiseModel) -> tuple[Floats, 
                     else noise_model.relative_cov(member.relative) + np.diag(member.variance)
                 )
                 sources.append((member.position - to_vector(member.relative), cov))
-        information = inv(p) + sum((inv(c) for _, c in sources), np.zeros((3, 3)))
-        eta = sum((solve(c, y - x) for y, c in sources), np.zeros(3))
+        information = inv(p) + sum((inv(c) for _, c in sources), zeros((3, 3)))
+        eta = sum((solve(c, y - x) for y, c in sources), zeros(3))
         p = inv(information)
         x = x + p @ eta
         estimates.append((x, p))

@@ -7,7 +7,7 @@ with unit covariances, and by the joint filter of its star with the acting noise
 from typing import Any
 
 import numpy as np
-from numpy import inf, pi
+from numpy import eye, inf, pi, zeros
 from numpy.linalg import inv, solve
 
 Array = Any
@@ -39,7 +39,7 @@ def step(
 ) -> tuple[Array, Array, list[int]]:
     """Prediction of the members of a star from the last one's estimate; who joins has a flat prior."""
     n = len(star)
-    mean, cov = np.zeros((n, 3)), FLAT * np.eye(3 * n)
+    mean, cov = zeros((n, 3)), FLAT * eye(3 * n)
     rows = [(k, before.index(j)) for k, j in enumerate(star) if j in before]
     for k, a in rows:
         mean[k] = x[a] + moves[star[k]]
@@ -56,14 +56,14 @@ def joint(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int
     prior, at = x.ravel().copy(), x.ravel().copy()
     weight = inv(p)
     for _ in range(4):
-        h, r = weight + np.eye(len(at)) / FIX**2, weight @ (prior - at) + (fixes.ravel() - at) / FIX**2
+        h, r = weight + eye(len(at)) / FIX**2, weight @ (prior - at) + (fixes.ravel() - at) / FIX**2
         for k, m in enumerate(relative):
             if m is not None:
                 v = at[3 * k : 3 * k + 3] - at[:3]
                 gap = m - polar(v)
                 gap[1] = (gap[1] + pi) % (2 * pi) - pi
-                slope = np.array([(polar(v + e) - polar(v - e)) / 2e-5 for e in 1e-5 * np.eye(3)]).T
-                j = np.zeros((3, len(at)))
+                slope = np.array([(polar(v + e) - polar(v - e)) / 2e-5 for e in 1e-5 * eye(3)]).T
+                j = zeros((3, len(at)))
                 j[:, :3], j[:, 3 * k : 3 * k + 3] = -slope, slope
                 w = np.diag([RANGE**-2, ANGLE**-2, ANGLE**-2])
                 h, r = h + j.T @ w @ j, r + j.T @ w @ gap
@@ -76,19 +76,19 @@ def laplacian(x: Array, p: Array, fixes: Array, relative: list[Array], new: list
     n, vectors = len(x), {k: cartesian(m) for k, m in enumerate(relative) if m is not None}
     for k in new:
         x[k] = x[0] + vectors[k] if k in vectors else fixes[k]
-    lap, delta = np.zeros((n, n)), np.zeros((n, 3))
+    lap, delta = zeros((n, n)), zeros((n, 3))
     for k, v in vectors.items():
         lap[[0, k], [0, k]] += 1.0
         lap[[0, k], [k, 0]] -= 1.0
         delta[0], delta[k] = delta[0] - v, delta[k] + v
-    h = np.kron(np.vstack([lap, np.eye(n)]), np.eye(3))
+    h = np.kron(np.vstack([lap, eye(n)]), eye(3))
     p = inv(inv(p) + h.T @ h)
     return (x.ravel() + p @ h.T @ (np.vstack([delta, fixes]).ravel() - h @ x.ravel())).reshape(-1, 3), p
 
 
 def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.random.Generator) -> Array:
     """RT-LE m of fixes, LKF-SA with unit covariances and the joint filter; K = 0 makes both Kalman filters."""
-    error = np.zeros((3, len(position)))
+    error = zeros((3, len(position)))
     state: dict[int, Any] = {}
     for t, (at, speed) in enumerate(zip(position, velocity, strict=True)):
         there = np.isfinite(at[:, 0])
@@ -102,7 +102,7 @@ def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.rand
         error[0, t] = ((fixes[ego] - at[ego]) ** 2).sum()
         for k, (update, unit) in enumerate(((laplacian, True), (joint, False)), 1):
             q = np.ones_like(std) if unit else (DT * std) ** 2
-            x, p, before = state.get(k, (np.zeros((0, 3)), np.zeros((0, 0)), []))
+            x, p, before = state.get(k, (zeros((0, 3)), zeros((0, 0)), []))
             mean, cov, new = step(x, p, star, before, DT * measured, q)
             if t == 0:
                 mean[0] = fixes[ego]
