@@ -281,6 +281,17 @@ def test_hills_are_followed_by_fixes_that_are_denser_than_odometry(tmp_path):
     assert error(read, co.Kalman()) < 0.3 * error(read, co.GNSS())
 
 
+@pytest.mark.parametrize("kind", ["vz", "vz_body"])
+def test_a_velocity_upwards_counts_at_its_own_times(tmp_path, kind):
+    """Beside a speed at twice the rate and other stamps; without one it is counted as left out."""
+    up, step = np.gradient(path("hill")[:, 2], 0.1), np.arange(len(T))
+    beside = {"speed": np.where(step % 2, nan, SPEED), kind: np.where(step % 4 == 1, up, nan)}
+    rec = log(tmp_path, "hill", 1.5, 10, heading=COURSE, **beside)[0].recording
+    assert_allclose(rec.velocity[0, :, 0, 2], np.interp(rec.t, T, up), atol=0.06)
+    assert rec.sensors.climb_std == 0.0
+    assert f"{len(T) // 4} velocities aside or up" in str(co.read_log(tmp_path, ignore=["speed"]).summary)
+
+
 def test_stamps_at_two_rates_are_kept(tmp_path):
     steps = cumsum(np.tile([2, 3], 300))
     read, t, _ = log(tmp_path, "car", 1.5, 1, steps=steps[steps < len(T)].tolist())

@@ -26,7 +26,7 @@ from .heading import (
     step_means,
     unknown,
 )
-from .units import BODY, Rows, Summary, in_group, only, row_of
+from .units import Rows, Summary, in_group, only, row_of
 
 BETWEEN = (0.25, 0.5, 0.75)
 """Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
@@ -53,7 +53,8 @@ NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is estimated from i
 UNUSED_SHARE, LEAST_FIXES = 0.05, 5
 """Share of what was logged that may be left out without a sentence; samples of which one says something."""
 
-VELOCITIES = ("vx", "vy", "vz")
+VELOCITIES, LEVEL = ("vx", "vy", "vz"), ("speed", "vy_body", "vz")
+"""Velocity in the world, and forward, left and up once tilt is taken off."""
 
 
 class Shown(NamedTuple):
@@ -141,7 +142,8 @@ def stacked(members: Mapping[str, Member], field: str) -> Floats:
 
 
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
-    """Rows of one vehicle as samples (M, C) of some kinds at one time each, NaN where a kind is missing.
+    """Rows of one vehicle as samples (M, C) of some kinds at the times of the first `required` ones; others are on the
+    straight lines between their own samples, NaN where there are none.
 
     Args:
         rows: in SI units.
@@ -160,7 +162,8 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
             "a sample the same t, rounded if need be",
             rows["vehicle"].iloc[0],
         )
-    return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
+    table = table.fillna(table.iloc[:, required:].interpolate("index", limit_direction="both"))[whole]
+    return Signal(table.index.to_numpy(), table.to_numpy(copy=True))
 
 
 def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
@@ -194,7 +197,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if flat and not steps.planar:
         summary.assume("heights of {} are 0: none were logged, or few", name)
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
-    measured, turn, speed = (samples(rows, kinds, summary) for kinds in (("heading",), ("yaw_rate",), BODY))
+    measured, turn, speed = (samples(rows, kinds, summary) for kinds in (("heading",), ("yaw_rate",), LEVEL))
     speed = Signal(speed.t, np.nan_to_num(speed.value))
     still = np.zeros((len(grid), 3))
     none = np.full(len(grid), nan)
@@ -236,7 +239,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
                     "must have speeds and yaw rates in body frames",
                     'Log both, or pass frame="world".',
                 )
-        summary.refuse("world velocities in body frames", only(rows, *VELOCITIES))
+        summary.refuse("world velocities in body frames", only(rows, *VELOCITIES[:2]))
         signals, heading = [speed, turn], Course(heading_at(measured, turn, inf))
         along = _heading(measured, None, shown, derived, way, steps)
         velocity, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
@@ -272,7 +275,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     wander = _wander(heading, moves, steps)
     if by_fixes:  # at first a velocity is less certain than later, all the way to the next fix
         wander = np.maximum(wander, np.ptp(fixes.t) / len(fixes.t) * _before(Signal(fixes.t, shown.std), steps) ** 2)
-    climbs = 0.0 if flat or by_fixes or rows["kind"].isin(("vz", "vz_body")).any() else climbing(fixes)
+    climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
 
@@ -308,7 +311,7 @@ def _in_world(
     """Velocity (T, 3), NaN where its direction is unknown, None where the fixes have to show it; the samples that it is
     of; and the heading, by `measured` ones or derived."""
     summary, speed = steps.summary, way.speed
-    world, speeds = samples(rows, VELOCITIES, summary, 2), only(rows, "speed")
+    world, speeds = samples(rows, VELOCITIES, summary, 2), only(rows, *LEVEL[:2])
     heading = _heading(measured, world, shown, derived, way, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
@@ -329,8 +332,8 @@ def _in_world(
         kept, own = np.isfinite(velocity[:, 0]), np.isin(at, speed.t)
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
         means = step_means(Signal(at[kept], velocity[kept]), steps.grid) + 0.0 * moving(steps.grid + 0.5 * steps.dt)
-        beside = [steps.offset.get(f"{name}.{axis}", steps.offset.get(axis, 0.0)) for axis in VELOCITIES]
-        return means - beside, Signal(at[own & kept], at), heading
+        beside = [steps.offset.get(f"{name}.{axis}", steps.offset.get(axis, 0.0)) for axis in VELOCITIES[:2]]
+        return means - [*beside, 0.0], Signal(at[own & kept], at), heading
     if len(speed.t):
         raise InputError(
             f"{row_of(speeds)}, speed",
@@ -346,6 +349,7 @@ def _in_world(
             "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z.",
         )
     summary.assume(NO_ODOMETRY, name)
+    summary.refuse("velocities aside or up without the others", only(rows, *LEVEL))
     return None, way.fixes, heading._replace(wanders=shown.wanders)
 
 
