@@ -64,7 +64,8 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
         raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA in ASCII", "Save it so, with fixes.")
     stds = [name for name in map(str, frame) if name.endswith("_std")]
     frame[stds] = frame.groupby("t")[stds].transform("last")
-    early = frame["t"] < sentences.first_day  # sentences before the first date are of its day
+    early = frame["t"] < sentences.first_day  # sentences before the first date
+    frame["height"] += frame["separation"].ffill().bfill().fillna(0.0)
     return of_kinds(frame.assign(t=frame["t"] + sentences.first_day * early, vehicle=path.stem), path.name)
 
 
@@ -85,7 +86,8 @@ class _Sentences:
                 raise ValueError("latitude and longitude must be ddmm.mmm and dddmm.mmm")
             if not s.quality or s.lat == "" or s.lon == "":
                 return "fixes of quality 0"
-            row = dict(zip(FIX, map(float, [s.lat, s.lon, float(s.alt or 0.0) + float(s.sep or 0.0)]), strict=True))
+            numbers = [np.nan if number == "" else float(number) for number in (s.lat, s.lon, s.alt, s.sep)]
+            row = dict(zip((*FIX, "separation"), numbers, strict=True))
         elif s.msgID == "GST":
             stds = [float(std) for std in (s.stdLat, s.stdLong, s.stdAlt)]
             row = {f"{kind}_std": std if std > 0 else np.nan for kind, std in zip(FIX, stds, strict=True)}
@@ -100,9 +102,8 @@ class _Sentences:
 
     def _clock(self, time: Any, date: Any) -> None:
         seconds = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6
+        self.day += DAY_S * (self.day + seconds < self.last - DAY_S / 2)
         if isinstance(date, datetime.date):
-            self.day = (date - datetime.date(1970, 1, 1)).days * DAY_S
-            self.first_day = self.first_day or self.day
-        elif self.day + seconds < self.last - DAY_S / 2:
-            self.day += DAY_S
+            passed, self.day = self.day, (date - datetime.date(1970, 1, 1)).days * DAY_S
+            self.first_day = self.first_day or self.day - passed
         self.last = self.day + seconds

@@ -134,8 +134,8 @@ def check_one_drive(rows: Rows, name: str) -> None:
 
 def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Origin | None]:
     """Rows in SI units, with x, y, z (east, north, up) in place of latitude, longitude, height of WGS84; and the origin
-    of that frame: the given one, or the first complete fix in degrees (its height 0 where there is none in the log),
-    None where positions were local. Fixes `_nowhere` are none.
+    of that frame: the given one, or the first fix in degrees, None where positions were local. A fix without a height
+    is brought over at the usual one of the vehicle, else of the log, else of the origin (0); fixes `_nowhere` are none.
 
     Raises:
         InputError: positions in metres beside those in degrees without an origin, or degrees that are never complete.
@@ -145,7 +145,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     rows = rows.assign(kind=[kind.name for kind in kinds], value=scale * rows["value"] + offset)
     angle = rows["kind"].isin(ANGLES[:3])
     rows = rows.assign(value=rows["value"].mask(angle, wrap(rows["value"])), std=rows["std"] * abs(scale))
-    rows = _by_attitude(rows, summary)
+    rows = _by_attitude(rows, summary).replace({"kind": {"vz_body": "vz"}})
     keys = ["t", "vehicle", "kind"]
     none = _nowhere(rows)
     summary.refuse("fixes at zero, which are none", rows[none])
@@ -162,9 +162,11 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
             "ignore= leaves out kinds, and topics of a bag.",
         )
     fixes = rows[geodetic].drop_duplicates(keys).pivot(index=keys[:2], columns="kind", values="value")
-    if "height" not in fixes:
-        fixes["height"] = origin[2] if origin else 0.0
-    fixes = fixes.reindex(columns=["latitude", "longitude", "height"]).dropna()
+    fixes = fixes.reindex(columns=["latitude", "longitude", "height"])
+    height = fixes["height"]
+    for usual in (height.groupby("vehicle").transform("median"), height.median(), origin[2] if origin else 0.0):
+        fixes["height"] = fixes["height"].fillna(usual)
+    fixes = fixes.dropna()
     if not len(fixes):
         raise InputError("latitude, longitude", "never together", "must be given at one time", "Check the columns.")
     if origin is None:
@@ -179,7 +181,9 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
         )
     enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
     value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(keys).index).to_numpy())
-    return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
+    lost = geodetic & value.isna()
+    summary.refuse("incomplete fixes, without latitude or longitude", rows[lost])
+    return rows.assign(value=value, kind=rows["kind"].replace(ENU))[~lost], origin
 
 
 def _by_attitude(rows: Rows, summary: Summary) -> Rows:
