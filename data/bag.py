@@ -126,8 +126,8 @@ def read_bag(
                 frame = frame.join(pd.DataFrame(np.stack(frame[field].tolist()), frame.index).add_prefix(f"{field}_"))
             (vehicle, partner), true = of[topic]
             kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
-            rows = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), path.name)
-            parts[topic] = rows[~rows["kind"].replace(QUATERNION, "heading").isin(ignore)]
+            kinds_read = kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true))
+            parts[topic] = of_kinds(kinds_read, path.name)
     except InputError:
         raise
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all

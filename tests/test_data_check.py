@@ -354,7 +354,7 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     ("fault", "words"),
     [
         ("wheels", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
-        ("wheels in km/h", r"(scale=a\.speed:0\.9[78]\d*) mends it"),
+        ("wheels in km/h", r"(scale=a\.speed_kmh:0\.9[78]\d*) mends it"),
         ("current", r"(offset=a\.vx:-0\.[23]\d*,a\.vy:\S+) takes it off"),
         ("tunnel", r"a: its fixes are off by up to \d\S+ times its standard deviation from [67]\d\d to 8\d\d s"),
     ],

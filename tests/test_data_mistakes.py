@@ -357,14 +357,19 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path):
         ("scale=t:-1", r"scale of t = -1.0: must be .* > 0"),
         ("origin=nan,11.5,510", r"origin\[0\] = nan"),
         ("since=-5", "since, until"),
+        ("scale=range:2", "scale = 'range': must be one of a,.height, "),
+        ("offset=b.speed:2", "offset = 'b.speed'"),
+        ("std=range:2", "std = 'range'"),
     ):
         with refused(message):
             load_log(f"{tmp_path / 'a.csv'}?{words}")
 
 
-def test_an_origin_without_degrees_is_said_to_have_no_effect(tmp_path):
+def test_an_option_without_an_effect_is_said_to_have_none(tmp_path):
     (tmp_path / "log.csv").write_text(WIDE)
-    assert "origin= has no effect" in str(co.read_log(tmp_path / "log.csv", origin=(1, 2, 3)).summary)
+    text = str(co.read_log(tmp_path / "log.csv", origin=(1, 2, 3), ignore=["imu"]).summary)
+    assert "origin= has no effect" in text
+    assert "ignore=imu has no effect" in text
 
 
 def test_places_need_no_times(tmp_path):

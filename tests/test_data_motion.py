@@ -233,7 +233,7 @@ def test_a_course_that_is_held_without_fixes_is_lost_on_bends(tmp_path, method):
 
 def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path):
     sentences = " ".join(check(log(tmp_path / "log", "car", 1.5, 10, speed=SPEED, yaw_rate=-RATE)[0]).warnings)
-    assert "scale=yaw_rate:-1 mends it" in sentences
+    assert "scale=a.yaw_rate:-1 mends it" in sentences
     assert "odometry" not in sentences.replace("of fixes and odometry are", "")
 
 
@@ -322,6 +322,7 @@ def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
 NONE = {
     "heights": lambda rows, part: rows.assign(z=rows["z"].mask(part & rows["z"].notna(), -9999.0)),
     "places": lambda rows, part: rows.assign(**{k: rows[k].mask(part & rows[k].notna(), 0.0) for k in "xy"}),
+    "steps": lambda rows, part: rows.fillna(dict.fromkeys("xyz", 0.0)),
     "deviations": lambda rows, part: rows.assign(x_std=rows["x_std"].mask(part & rows["x_std"].notna(), 9999.0)),
     "speeds": lambda rows, part: rows.assign(speed=rows["speed"].mask(part, 255.0)),
 }
@@ -364,7 +365,7 @@ def test_a_truth_may_be_seldom_and_without_heights(tmp_path, every):
     [
         ("smoothed", r"a: its fixes are [01]\.\d+ \+- 0\.0\d s behind its odometry"),
         ("wind", r"a: it moves by 1\.[4-6]\d \+- 0\.\d+ m/s towards -?\d deg"),
-        ("down", "a: heights of fixes fall where vz is positive"),
+        ("down", "a: heights of fixes fall where vz is positive.* scale=a.vz:-1 mends"),
     ],
 )
 def test_what_a_log_holds_beside_its_odometry_is_named(tmp_path, fault, named):

@@ -67,6 +67,8 @@ FAR_AWAY = 3e5
 """m, from all others, where no vehicle cooperates."""
 LEAST_BACK = 0.02
 """Share of the way that a vehicle goes back, if it does."""
+FORWARD = "speed", "vx", "vy"
+"""Quantities that say how fast a vehicle goes ahead."""
 DIVERGED = 0.3
 """Scale error of odometry beyond which the filter that estimates it has diverged."""
 USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
@@ -199,7 +201,10 @@ def _axes(c: Check, column: int) -> str:
     height = pd.Series(rec.gnss[0, :, column, 2]).dropna()
     climbed = pd.Series(rec.velocity[0, :, column, 2] * rec.dt).cumsum()[height.index]
     if height.corr(climbed, min_periods=LEAST_COUNT + 1) < -0.9 and np.ptp(climbed) > 4 * rec.sensors.fix_std[2]:
-        return "heights of fixes fall where vz is positive: it counts upwards, so that scale=vz:-1 mends it."
+        return (
+            "heights of fixes fall where vz is positive: it counts upwards, so that "
+            f"{c.log.summary.scale(rec.ids[column], -1, 'vz', 'vz_body')} mends it."
+        )
     if not size or abs(np.vdot(driven, moved)) > LEAST_CORRELATION * size:
         return ""
     both = np.column_stack([driven, driven.conj()])  # swapped degrees have other lengths; one axis, both
@@ -313,7 +318,8 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         say(
             f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
             f"look turned by {-turn:.0f} deg. Speeds are positive forward, headings anticlockwise from +x (east), "
-            f"rad; clockwise from north in degrees is compass_deg. At 180, scale={name}.speed:-1 (or of .vx and .vy)."
+            f"rad; clockwise from north in degrees is compass_deg. At 180, "
+            f"{c.log.summary.scale(name, -1, *FORWARD)}."
         )
     elif turn is not None and (may := _may(row, "turned", LEAST_TURN)):
         say(
@@ -341,7 +347,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         say(
             f"{name}: its odometry {may} too {'fast' if row['speed_excess'] > 0 else 'slow'} by "
             f"{100 * abs(row['speed_excess']):.2f} +- {100 * row['speed_excess_error']:.2f} %: "
-            f"scale={name}.speed:{1 / (1 + row['speed_excess']):.4g} mends it (or of .vx and .vy), and a pose filter "
+            f"{c.log.summary.scale(name, 1 / (1 + row['speed_excess']), *FORWARD)} mends it, and a pose filter "
             "estimates it."
         )
     if may := _may(row, "yaw_rate_bias", LEAST_DRIFT):

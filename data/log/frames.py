@@ -211,19 +211,25 @@ def _by_attitude(rows: Rows, summary: Summary) -> Rows:
 
 
 def _nowhere(rows: Rows) -> Bools:
-    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where others of the vehicle are
-    too far away for its speed."""
+    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where the fix before or behind is too far
+    away for the vehicle's speed, as most of such fixes are, or that one."""
     key, axes = ["vehicle", "t"], ["x", "y", "latitude", "longitude"]
     fixes = only(rows, *axes).drop_duplicates([*key, "kind"]).pivot(index=key, columns="kind", values="value")
     fixes = fixes.reindex(columns=axes).reset_index()
     at_zero, no_degrees = (fixes[names].eq(0.0).all(axis=1) for names in (axes[:2], axes[2:]))
-    moves, vehicle = fixes.groupby("vehicle").diff(), fixes["vehicle"]
-    pace = np.hypot(moves["x"], moves["y"]) / moves["t"]
+    vehicle = fixes["vehicle"]
+
+    def pace(some: Rows) -> Any:
+        """m/s to each fix from the one before."""
+        moves = some.groupby("vehicle").diff()
+        return np.hypot(moves["x"], moves["y"]) / moves["t"]
+
+    usual = pace(fixes[~at_zero]).groupby(vehicle)
+    most = LEAPS * vehicle.map(usual.quantile(0.8).where(usual.count() >= LOCATING_FIXES))
     leap = at_zero != at_zero.groupby(vehicle).shift(fill_value=False)
-    usual = ~at_zero & ~leap
-    most = LEAPS * pace.where(usual).groupby(vehicle).transform("quantile", 0.8)
-    away = pace.where(leap).groupby(vehicle).transform("min") > most
-    away &= usual.groupby(vehicle).transform("sum") >= LOCATING_FIXES
+    far = leap & (pace(fixes) > most)
+    away = (far | far.shift(-1, fill_value=False)).groupby(leap.cumsum()).transform("any")
+    away |= vehicle.map(far[leap].groupby(vehicle).mean() > 0.5)
     none = fixes.set_index(key).index[no_degrees | (at_zero & away)]
     return rows.set_index(key).index.isin(none) & in_group(rows, "fix")
 

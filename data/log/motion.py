@@ -47,7 +47,7 @@ COURSE = (
 )
 ARM = "fixes are moved from the antenna to the reference point, of {}; assumes no slipping or reversing"
 HOLDS = "fixes that repeat while the odometry moves"
-OTHER_RATES = "yaw rates are read as rad/s anticlockwise, which fixes of {} contradict: scale=yaw_rate:"
+OTHER_RATES = "yaw rates are read as rad/s anticlockwise, which fixes of {} contradict: "
 NO_ODOMETRY = "no odometry of {}: a nearly constant velocity is estimated from its past fixes"
 
 UNUSED_SHARE, LEAST_FIXES = 0.05, 5
@@ -229,7 +229,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         shown = velocity_of_fixes(way, steps)
         derived, factor = heading_of_rates(way, steps.gap(turn.t))
     if factor != 1.0:
-        summary.assume(f"{OTHER_RATES}{factor:.3g} mends it", name)
+        summary.assume(f"{OTHER_RATES}{summary.scale(name, factor, 'yaw_rate')} mends it", name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):

@@ -41,10 +41,11 @@ from ..nmea import DAY_S, read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
-from .motion import VELOCITIES, Member, Steps, member, samples, stacked
+from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
 from .units import (
     KINDS,
+    QUATERNION,
     Rows,
     Summary,
     check_values,
@@ -219,10 +220,10 @@ def read_log(
     }
     rows = _rows(path, truth, summary, options)
     own, ends = rows["vehicle"] + "." + rows["kind"], (rows["vehicle"], rows["partner"])
-    names = *KINDS, *own.unique(), *(f"{name}.{kind}" for name in ends[0].unique() for kind in VELOCITIES)
+    logged, names = rows["kind"].unique(), {*rows["kind"], *own}
     quantity = rows["kind"].map({kind: KINDS[kind].name for kind in KINDS})
     of_one = rows["vehicle"] + "." + quantity
-    factor = factors(scale, ("t", *names, *of_one.unique()))
+    factor = factors(scale, sorted({"t", *names, *quantity, *of_one}))
     by_kind = pd.Series(1.0, rows.index)
     for kinds_of, like in ((rows["kind"], quantity), (own, of_one)):
         for key in (like.mask(like.isin(kinds_of)), kinds_of):
@@ -231,7 +232,8 @@ def read_log(
     for one, other in (ends, ends[::-1]):
         pair = one + "-" + other
         key = key.mask((rows["kind"] == "range") & pair.isin(offset), pair)
-    less = key.map(factors(offset, dict.fromkeys((*names, *key)), "offset")).fillna(0.0)
+    names |= {*key, "vx", "vy", *(ends[0] + ".vx"), *(ends[0] + ".vy")}
+    less = key.map(factors(offset, sorted(names), "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = without_codes(unwrapped(rows, summary), summary)
@@ -243,13 +245,14 @@ def read_log(
     if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     summary.rows = int((rows["true"] == 0).sum())
+    summary.logged = rows.groupby("vehicle")["kind"].unique().to_dict()
     rows, true_rows = not_vague(rows[rows["true"] == 0], summary), rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
     spans = only(rows, "x").groupby(["vehicle", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
     for name, span in spans.groupby("vehicle"):
         if (span["min"] < span["max"].cummax().shift()).any():
             summary.assume(SEVERAL, f"{name} ({', '.join(sorted(span['file']))})")
-    deviations = factors(std, [kind for kind in KINDS if kind != "message"], "std")
+    deviations = factors(std, sorted({*logged, *rows["kind"]} - {"message"}), "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
     paths = [samples(group, ("x", "y", "z"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
@@ -374,9 +377,16 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         parts = [_read_file(file, path, summary, **options) for file in files]
     if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
-    options = {**options, "ignore": (), "truth": ""}
+    ignore, options = options["ignore"], {**options, "ignore": (), "truth": ""}
     parts += [_read_file(file, path, Summary(), **options).assign(true=1.0) for file in true_files]
-    return pd.concat(parts, ignore_index=True)
+    rows = pd.concat(parts, ignore_index=True)
+    kind = rows["kind"].replace(QUATERNION, "heading")
+    left = kind.isin(ignore) & (rows["true"] == 0)
+    summary.unused.update("kind " + kind[left] + ", as ignore= asks")
+    for word in ignore:
+        if f" {word}" not in " ".join(summary.unused):
+            summary.assume(f"ignore={word} has no effect: nothing of that name was logged")
+    return rows[~left]
 
 
 def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows:

@@ -92,8 +92,7 @@ def _with_whole_stamps(frame: DataFrame, columns: Mapping[str, str]) -> DataFram
 def _long(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> DataFrame:
     frame = frame.assign(kind=words(frame, "kind", file))
     left = frame["kind"].isin(ignore)
-    for kind, count in frame["kind"][left].value_counts(sort=False).items():
-        summary.unused[f"kind {kind}, as ignore= asks"] += int(count)
+    summary.unused.update("kind " + frame["kind"][left] + ", as ignore= asks")
     frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
     strange = frame["kind"][~frame["kind"].isin(KINDS)]
     if len(strange):

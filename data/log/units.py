@@ -244,6 +244,7 @@ class Summary:
         unused: what was never meant to be read -> number of cells.
         odometry: s, from one sample of it to the next, 0 where there is none.
         rows: how many numbers were logged.
+        logged: vehicle -> kinds, as they are named in its files.
         shown: vehicles of which fixes alone have shown the velocity, or its direction without a gyro.
         reversed_pairs: observer times members, plus neighbour, of pairs that have only what the other end measured.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
@@ -268,6 +269,7 @@ class Summary:
     unused: Counter[str] = field(default_factory=Counter)
     odometry: float = 0.0
     rows: int = 0
+    logged: dict[Any, Any] = field(default_factory=dict)
     shown: list[str] = field(default_factory=list)
     reversed_pairs: list[int] = field(default_factory=list)
     assumed: dict[str, list[str]] = field(default_factory=dict)
@@ -284,6 +286,11 @@ class Summary:
             before, first = self.refused.get(reason, (0, where if isinstance(rows, int) else row_of(rows)))
             self.refused[reason] = before + number, first
 
+    def scale(self, name: str, factor: float, *quantities: str) -> str:
+        """The option that scales what a vehicle has logged of some quantities, under the names in its files."""
+        kinds = (kind for kind in self.logged.get(name, quantities) if KINDS[kind].name in quantities)
+        return f"scale={','.join(f'{name}.{kind}:{factor:.4g}' for kind in kinds)}"
+
     def assume(self, sentence: str, name: str = "") -> None:
         """Add a sentence, once, and a name that takes the place of its {}."""
         names = self.assumed.setdefault(sentence, [])
@@ -293,7 +300,7 @@ class Summary:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What is assumed, with the names."""
-        return tuple(sentence.format(", ".join(names)) for sentence, names in self.assumed.items())
+        return tuple(sentence.replace("{}", ", ".join(names)) for sentence, names in self.assumed.items())
 
     @property
     def unread(self) -> str:
