@@ -1,5 +1,6 @@
 """Readers of drives: tables, TUM trajectories, SUMO's floating-car data; a writer of tables."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,8 +47,17 @@ def read_table(
         factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name) for name in used[1:]
     )
     numbers = np.column_stack(axes)
-    velocity, ids = numbers[:, 3:] if has_velocity else None, words(frame, "id", path.name)
-    return assemble(ids, t, numbers[:, :3], velocity, **options, file=path.name, name=path.stem, source=source)
+    ids = [re.sub("^'(?=[=+@-])", "", name) for name in words(frame, "id", path.name)]  # of `spreadsheet`
+    return assemble(
+        ids,
+        t,
+        numbers[:, :3],
+        numbers[:, 3:] if has_velocity else None,
+        **options,
+        file=path.name,
+        name=path.stem,
+        source=source,
+    )
 
 
 def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
@@ -126,5 +136,6 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
     ahead = np.column_stack([np.sin(angle) * np.cos(incline), np.cos(angle) * np.cos(incline), np.sin(incline)])
     centre, velocity = np.column_stack([x, y, z]) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
     source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"
-    ids = words(frame, "id", path.name)
-    return assemble(ids, t, centre, velocity, **options, file=path.name, name=path.stem, source=source)
+    return assemble(
+        words(frame, "id", path.name), t, centre, velocity, **options, file=path.name, name=path.stem, source=source
+    )

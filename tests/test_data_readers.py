@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -26,8 +27,10 @@ GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,
 @pytest.mark.parametrize("out", ["fleet.csv", "fleet.parquet"])
 @pytest.mark.parametrize("name", ["town10-clients", "town04"])
 def test_tables_come_back_bit_by_bit(tmp_path, name, out):
-    write_table(load_fleet(name), tmp_path / out)
-    assert load_fleet(tmp_path / out).digest == load_fleet(name).digest
+    fleet = load_fleet(name)
+    fleet = replace(fleet, ids=("=a", *fleet.ids[1:]))
+    write_table(fleet, tmp_path / out)
+    assert load_fleet(tmp_path / out).digest == fleet.digest
 
 
 def test_tum_files_are_what_evo_reads(tmp_path):

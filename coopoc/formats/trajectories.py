@@ -19,7 +19,8 @@ def write_tum(path: str | Path, t: ArrayLike, position: ArrayLike, heading: Arra
         heading: (T,) rad from +x, anticlockwise; None where it is unknown: all poses then point along +x.
 
     Raises:
-        InputError: shapes, numbers that are not finite, stamps that do not increase, headings in degrees.
+        InputError: shapes, numbers that are not finite, stamps that do not increase, headings that jump by
+            more than two turns, as degrees do.
 
     Source: the tools of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
 
