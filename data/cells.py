@@ -206,8 +206,13 @@ def factors(mapping: Mapping[str, float] | None, names: Collection[str], field: 
     for name, value in named(field, mapping or {}, f"Give {field}={{name: number}}.").items():
         one_of(field, name, names)
         least = 1e-12 if field == "std" or name == "t" else -MAX_NUMBER
-        allowed = f"a finite number other than 0{', and > 0' * (least > 0)}"
-        if not number(f"{field} of {name}", value, least, MAX_NUMBER, allowed=allowed):
+        if not number(
+            f"{field} of {name}",
+            value,
+            least,
+            MAX_NUMBER,
+            allowed=f"a finite number other than 0{', and > 0' * (least > 0)}",
+        ):
             raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
     return dict(mapping or {})
 
@@ -268,8 +273,7 @@ def usual_key(header: str) -> str:
     >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "yaw_acc", "UTM_North")]
     ['t', 'latitude', 'compass_deg', '', 'y']
     """
-    pieces = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
-    parts = {header.lower(), *(word.lower() for word in pieces)}
+    parts = {header.lower(), *(word.lower() for word in re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header))}
     usual = (key for key, words in USUAL_HEADERS.items() if not parts.isdisjoint(words.split()))
     return next(usual, "") if parts.isdisjoint(OTHER_MEANINGS) else ""
 

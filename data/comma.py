@@ -48,8 +48,9 @@ def read_segment(path: Path, summary: Summary) -> Rows:
     fixes.loc[fixes["fast"] < MIN_COG_SPEED_M_S, "compass_deg"] = np.nan
     summary.assume("the heading is the course that the receiver states while it moves")
     names = ("latitude", "longitude", "height")
-    degrees = pymap3d.ecef2geodetic(*true[[*"xyz"]].to_numpy().T)
-    tables[2] = true[["t"]].assign(true=1.0, **dict(zip(names, degrees, strict=True)))
+    tables[2] = true[["t"]].assign(
+        true=1.0, **dict(zip(names, pymap3d.ecef2geodetic(*true[[*"xyz"]].to_numpy().T), strict=True))
+    )
     return of_kinds(pd.concat(tables, ignore_index=True).assign(vehicle=path.name), path.name)
 
 

@@ -52,8 +52,9 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
             summary.unused[f"{path.name}: lines {tag}"] += len(lines)
             continue
         names = FORMS[tag].split()
-        cut = [words[: len(names)] for words in lines.values()]
-        table = to_numbers(path.name, [*lines], cut, f"{tag} {FORMS[tag]}", len(names))
+        table = to_numbers(
+            path.name, [*lines], [words[: len(names)] for words in lines.values()], f"{tag} {FORMS[tag]}", len(names)
+        )
         f = pd.DataFrame(table, [*lines], names).assign(vehicle=vehicle, true=float(tag.startswith("point")))
         if tag == "odom2diff":
             both, track = f["first_cov"] + f["second_cov"], 2 * f["half_track"]

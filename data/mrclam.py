@@ -250,8 +250,9 @@ def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     finite = np.isfinite(true)
     parts = (np.where(finite, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
     sums = [part.reshape(-1, window, true.shape[1]).sum(1).T for part in parts]
-    pairs = zip(np.stack(sums[1:], -1), sums[0], strict=True)
-    return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
+    return np.array(
+        [np.linalg.lstsq(left, right)[0] for left, right in zip(np.stack(sums[1:], -1), sums[0], strict=True)]
+    ).T
 
 
 def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = inf) -> float:
@@ -292,8 +293,12 @@ def _measurements(folder: Path, numbers: list[int]) -> Floats:
         file = folder / f"Robot{robot}_Measurement.dat"
         table = _read(file, "time barcode range bearing")
         subject = subject_of.reindex(table[:, 1], fill_value=0.0).to_numpy()
-        itself = "must be another's: a robot does not measure itself"
-        _refuse(file, subject == robot, itself, "Check Barcodes.dat, or remove the line.")
+        _refuse(
+            file,
+            subject == robot,
+            "must be another's: a robot does not measure itself",
+            "Check Barcodes.dat, or remove the line.",
+        )
         _refuse(file, table[:, 2] <= 0, "must have a range > 0 m", "Remove the line.")
         parts.append(np.column_stack([table[:, 0], np.full(len(table), column), subject, table[:, 2:]]))
     rows = np.vstack(parts)

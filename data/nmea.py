@@ -89,8 +89,8 @@ class _Sentences:
             numbers = [np.nan if number == "" else float(number) for number in (s.lat, s.lon, s.alt, s.sep)]
             row = dict(zip((*FIX, "separation"), numbers, strict=True))
         elif s.msgID == "GST":
-            stds = [float(std) for std in (s.stdLat, s.stdLong, s.stdAlt)]
-            row = {f"{kind}_std": std if std > 0 else np.nan for kind, std in zip(FIX, stds, strict=True)}
+            stds = zip(FIX, map(float, (s.stdLat, s.stdLong, s.stdAlt)), strict=True)
+            row = {f"{kind}_std": std if std > 0 else np.nan for kind, std in stds}
         elif s.status != "A":
             return "velocities that the receiver calls invalid"
         else:

@@ -37,17 +37,18 @@ def card(name: str) -> dict[str, Any]:
 
 def in_words(facts: dict[str, Any]) -> dict[str, str]:
     """Where a generated fleet comes from, its size and statistics, as texts."""
-    near = "mean {mean:g} within {radius:g} m (cap {cap:g}), some in {any:.0%} of the steps"
+    near, speed, height = facts["neighbours"], facts["speed"], facts["height"]
     return {
-        "map": "{map}, {map_licence}".format(**facts),
-        "made by": "{command} (SUMO {sumo})".format(**facts),
+        "map": f"{facts['map']}, {facts['map_licence']}",
+        "made by": f"{facts['command']} (SUMO {facts['sumo']})",
         "sha256": facts["sha256"],
-        "size": "{vehicles} vehicles x {steps} steps of {dt:g} s".format(**facts),
-        "speed": "{min:g}..{max:g} m/s, mean {mean:g}, standing {standing:.0%}".format(**facts["speed"]),
-        **{f"speed of {k}": "{:g}..{:g} m/s".format(*ends) for k, ends in enumerate(facts.get("speeds", ()), start=1)},
-        "neighbours": near.format(**facts["neighbours"]),
-        "height": "{:g}..{:g} m".format(*facts["height"]),
-        "acceleration": "at most {acceleration:g} m/s^2".format(**facts),
+        "size": f"{facts['vehicles']} vehicles x {facts['steps']} steps of {facts['dt']:g} s",
+        "speed": f"{speed['min']:g}..{speed['max']:g} m/s, mean {speed['mean']:g}, standing {speed['standing']:.0%}",
+        **{f"speed of {k}": f"{low:g}..{high:g} m/s" for k, (low, high) in enumerate(facts.get("speeds", ()), 1)},
+        "neighbours": f"mean {near['mean']:g} within {near['radius']:g} m (cap {near['cap']:g}), some in "
+        f"{near['any']:.0%} of the steps",
+        "height": f"{height[0]:g}..{height[1]:g} m",
+        "acceleration": f"at most {facts['acceleration']:g} m/s^2",
     }
 
 
@@ -58,7 +59,7 @@ def bundled(name: str) -> Fleet:
     Fleet(town10: 60 vehicles x 900 steps, dt 0.1 s)
     """
     made = card(name)
-    source = "simulated with SUMO {sumo} on CARLA's {map}, seed {recipe[seed]}, smoothed".format(**made)
+    source = f"simulated with SUMO {made['sumo']} on CARLA's {made['map']}, seed {made['recipe']['seed']}, smoothed"
     return replace(read_table(FLEETS / f"{name}.parquet"), source=source, licence=made["map_licence"])
 
 
@@ -193,11 +194,11 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """
     kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix))
     if kind is None:
-        endings = ".csv, .parquet, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
         raise InputError(
             "data",
             str(path),
-            f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files",
+            "must end in .csv, .parquet, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz, or be a folder of TUM, MR.CLAM "
+            "or log files",
             f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.",
         )
     return kind

@@ -113,8 +113,9 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
         )
     part = data.between(first, last)
     if isinstance(part, Recording):
-        note = f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s"
-        return replace(part, notes=(*part.notes, note))
+        return replace(
+            part, notes=(*part.notes, f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s")
+        )
     return part
 
 

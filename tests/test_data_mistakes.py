@@ -327,9 +327,9 @@ def test_a_header_may_stand_in_one_of_several_tables(tmp_path):
 
 
 def test_a_header_that_no_table_has_is_named(tmp_path):
-    with refused(r"columns\['partner'\] = 'pear': is in no table, .* Did you mean peer"):
+    with refused(r"columns\['partner'\], a header = 'pear': must be .* Did you mean peer"):
         co.read_log(parts(tmp_path / "log"), columns={"vehicle": "car", "partner": "pear"}, kinds={"uwb": "range"})
-    with refused(r"columns\['t'\] = 'tme': is in no table, .*"):
+    with refused(r"columns\['t'\], a header = 'tme': must be one of .*"):
         co.read_log(tmp_path / "log", columns={"t": "tme"}, ignore=["uwb"], truth=tmp_path / "log" / "car.csv")
 
 

@@ -176,8 +176,9 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
 def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     """What is of each step, of the one two samples of the odometry later, as two steps may share one; the last at the
     end."""
-    at = np.arange(of_step.shape[axis]) + 2 * max(round(c.log.summary.odometry / c.world.dt), 1)
-    return of_step.take(at, axis, mode="clip")
+    return of_step.take(
+        np.arange(of_step.shape[axis]) + 2 * max(round(c.log.summary.odometry / c.world.dt), 1), axis, mode="clip"
+    )
 
 
 def moves(c: Check, column: int, means: int = 1) -> AnyArray:
@@ -430,8 +431,7 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
         known = nan * c.variance[..., 0] if truth.heading is None else truth.heading
         residual[:, 1] = wrap(residual[:, 1] - turned + known[rec.links.step, rec.links.observer])
     used, x = np.isfinite(residual), np.where(np.isfinite(x), x, c.x)
-    expected = np.where(used, stated, c.expected)
-    return replace(c, x=x, relative=np.where(used, residual, c.relative), expected=expected)
+    return replace(c, x=x, relative=np.where(used, residual, c.relative), expected=np.where(used, stated, c.expected))
 
 
 def on_time(c: Check, alike: bool, true: Check) -> Check:

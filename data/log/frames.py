@@ -143,8 +143,9 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     kinds = [KINDS[name] for name in rows["kind"]]
     scale, offset = np.array([(kind.scale, kind.offset) for kind in kinds]).T
     rows = rows.assign(kind=[kind.name for kind in kinds], value=scale * rows["value"] + offset)
-    angle = rows["kind"].isin(ANGLES[:3])
-    rows = rows.assign(value=rows["value"].mask(angle, wrap(rows["value"])), std=rows["std"] * abs(scale))
+    rows = rows.assign(
+        value=rows["value"].mask(rows["kind"].isin(ANGLES[:3]), wrap(rows["value"])), std=rows["std"] * abs(scale)
+    )
     rows = _by_attitude(rows, summary).replace({"kind": {"vz_body": "vz"}})
     keys = ["t", "vehicle", "kind"]
     none = _nowhere(rows)
@@ -179,8 +180,9 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
             "which is another. Read each place alone (since=, until=, or a folder each), with an origin= near it",
             name,
         )
-    enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
-    value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(keys).index).to_numpy())
+    value = rows["value"].mask(
+        geodetic, pd.DataFrame(metres, fixes.index, [*ENU]).stack().reindex(rows.set_index(keys).index).to_numpy()
+    )
     lost = geodetic & value.isna()
     summary.refuse("incomplete fixes, without latitude or longitude", rows[lost])
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[~lost], origin
@@ -211,8 +213,8 @@ def _by_attitude(rows: Rows, summary: Summary) -> Rows:
 
 
 def _nowhere(rows: Rows) -> Bools:
-    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where the fix before or behind is too far
-    away for the vehicle's speed, as most of such fixes are, or that one."""
+    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where the last fix before, or the next one,
+    is too far away for the vehicle's speed."""
     key, axes = ["vehicle", "t"], ["x", "y", "latitude", "longitude"]
     fixes = only(rows, *axes).drop_duplicates([*key, "kind"]).pivot(index=key, columns="kind", values="value")
     fixes = fixes.reindex(columns=axes).reset_index()
@@ -229,7 +231,6 @@ def _nowhere(rows: Rows) -> Bools:
     leap = at_zero != at_zero.groupby(vehicle).shift(fill_value=False)
     far = leap & (pace(fixes) > most)
     away = (far | far.shift(-1, fill_value=False)).groupby(leap.cumsum()).transform("any")
-    away |= vehicle.map(far[leap].groupby(vehicle).mean() > 0.5)
     none = fixes.set_index(key).index[no_degrees | (at_zero & away)]
     return rows.set_index(key).index.isin(none) & in_group(rows, "fix")
 
@@ -268,10 +269,14 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
         "min_range": 0.0,
     }
     if body:
-        rate = rare * of(base.yaw_rate_std, "rad/s", "yaw_rate")
-        noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
-        noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
-        noise["velocity_bias_std"] = VELOCITY_BIAS_STD * ("vy_body" in used)
+        noise |= {
+            "velocity_reading": "speed",
+            "yaw_rate_std": rare * of(base.yaw_rate_std, "rad/s", "yaw_rate"),
+            "compass": "heading" in used,
+            "speed_scale_std": SCALE_STD,
+            "yaw_rate_bias_std": RATE_BIAS_STD,
+            "velocity_bias_std": VELOCITY_BIAS_STD * ("vy_body" in used),
+        }
     derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], 0).tolist()
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of(HEADING_STD, "rad", "heading")

@@ -110,8 +110,11 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     sampled = heading.t if yaw_rate is None else yaw_rate.t
 
     def at(times: Floats) -> Floats:
-        angle = wrap(np.interp(times, heading.t, offset) + _angle(yaw_rate, times))
-        return np.where(covered(sampled, times, gap, gap / 2), angle, nan)
+        return np.where(
+            covered(sampled, times, gap, gap / 2),
+            wrap(np.interp(times, heading.t, offset) + _angle(yaw_rate, times)),
+            nan,
+        )
 
     return at
 
@@ -222,8 +225,9 @@ def integral(signal: Signal, at: Floats) -> Floats:
     start = signal.t[0]
     ends = np.append(at, signal.t) - start
     t = np.r_[ends.min() - 1, signal.t - start, ends.max() + 1]
-    value = np.pad(signal.value, ((1, 1), (0, 0)), "edge")
-    path = scipy.interpolate.BSpline(np.pad(t, 1, "edge"), value, 1).antiderivative()
+    path = scipy.interpolate.BSpline(
+        np.pad(t, 1, "edge"), np.pad(signal.value, ((1, 1), (0, 0)), "edge"), 1
+    ).antiderivative()
     return np.asarray(path(at - start) - path(0.0))
 
 

@@ -44,16 +44,20 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     summary, sent = steps.summary, only(rows, "message")
     measured = _measured(rows, members, there, steps)
     if mutual:
-        stands = np.array([member.stands for member in members.values()])
-        far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
-        aimed = measured[measured["component"] == 1]
-        reached = far.set_index(LINK_COLUMNS).index.isin(aimed.set_index(LINK_COLUMNS).index)
+        far = measured[
+            (measured["component"] == 0)
+            & ~np.array([member.stands for member in members.values()])[measured["neighbour"]]
+        ]
+        reached = far.set_index(LINK_COLUMNS).index.isin(
+            measured[measured["component"] == 1].set_index(LINK_COLUMNS).index
+        )
         if reached.any():
             summary.assume(RADAR, str(int(reached.sum())))
         back = far[~reached]
         heard = back["neighbour"] * len(members) + back["observer"]
-        own = measured["observer"] * len(members) + measured["neighbour"]
-        summary.reversed_pairs = np.setdiff1d(heard, own).tolist()
+        summary.reversed_pairs = np.setdiff1d(
+            heard, measured["observer"] * len(members) + measured["neighbour"]
+        ).tolist()
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
         both = both.drop_duplicates([*LINK_COLUMNS, "component"])
         if len(both) > len(measured):
@@ -159,8 +163,9 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     table = rows.assign(**numbers, component=rows["kind"].map(COMPONENTS).astype(int))[good]
     table = table.sort_values("lag", key=np.abs, kind="stable")
     again = table.duplicated([*LINK_COLUMNS, "component"])
-    reason = "relative measurements beside a nearer one of the same pair, kind and step"
-    summary.refuse(reason, table[again].sort_index())
+    summary.refuse(
+        "relative measurements beside a nearer one of the same pair, kind and step", table[again].sort_index()
+    )
     table = table[~again]
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
     moved, vague, full = _to_step(table, members, steps, NEAR_STDS * (std if std > 0.0 else Sensors().gnss_std[0]))

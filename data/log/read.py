@@ -13,7 +13,6 @@ from scipy.interpolate import Akima1DInterpolator
 
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Floats, instance, named, number, one_of, texts
-from coopoc.errors import suggestion
 from coopoc.paths import given_path
 from coopoc.text import short_repr
 from coopoc.workers import progress_bar
@@ -111,8 +110,9 @@ class Log:
         Raises:
             InputError: a part of fewer than two steps.
         """
-        truth = self.truth and parted(self.truth, since, until)
-        return replace(self, recording=parted(self.recording, since, until), truth=truth)
+        return replace(
+            self, recording=parted(self.recording, since, until), truth=self.truth and parted(self.truth, since, until)
+        )
 
 
 def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
@@ -367,13 +367,7 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         tables = [file for file in (*files, *true_files) if options["columns"] and file.suffix.lower() in TABLES]
         names = {header for file in tables for header in headers(file)}
         for key, header in options["columns"].items():
-            if header not in names:
-                raise InputError(
-                    f"{path.name}: columns[{key!r}]",
-                    repr(header),
-                    f"is in no table, which have {', '.join(sorted(names))}",
-                    suggestion(header, names, "Name a column of a table."),
-                )
+            one_of(f"{path.name}: columns[{key!r}], a header", header, sorted(names))
         parts = [_read_file(file, path, summary, **options) for file in files]
     if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
@@ -471,8 +465,12 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
-            steps = at.assign(t=((at["t"] - t.min() + SAME_INSTANT) / step).round())
-            return max(float(steps.duplicated(["vehicle", "t"]).mean()), LOST)
+            return max(
+                float(
+                    at.assign(t=((at["t"] - t.min() + SAME_INSTANT) / step).round()).duplicated(["vehicle", "t"]).mean()
+                ),
+                LOST,
+            )
 
         parts = min((1, 2, 3, 4, 5), key=lambda n: lost(step / n))
         if parts > 1:
@@ -508,8 +506,10 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
     for column, vehicle in enumerate(ids):
         own_rows = rows[rows["vehicle"] == vehicle]
         true, heading = samples(own_rows, ("x", "y", "z"), Summary(), axes), samples(own_rows, ("heading",), Summary())
-        headings = np.unwrap(heading.value, axis=0)
-        for first, t, value in ((0, true.t, np.nan_to_num(true.value)), (3, heading.t, headings)):
+        for first, t, value in (
+            (0, true.t, np.nan_to_num(true.value)),
+            (3, heading.t, np.unwrap(heading.value, axis=0)),
+        ):
             out = poses[:, column, first : first + 3]
             if len(t) > 1:
                 out[:] = interpolate(t - steps[0], value, steps - steps[0], longest_gap(t, recording.dt, max_gap))

@@ -109,8 +109,7 @@ def together(log: Log) -> tuple[Log, str]:
         )
     t = rec.t - rec.t[0]
     span = "throughout" if there.all() else f"from {t[first]:.1f} to {t[last - 1]:.1f} s, where all are there"
-    truth = log.truth and log.truth.between(first, last)
-    return replace(log, recording=rec.between(first, last), truth=truth), span
+    return replace(log, recording=rec.between(first, last), truth=log.truth and log.truth.between(first, last)), span
 
 
 def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:

@@ -66,8 +66,9 @@ def read_log_table(
     if "t" not in frame:
         placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
         if not (placed and "vehicle" in frame and frame["vehicle"].is_unique):
-            allowed = "is needed; one of places alone has vehicle, x, y, each vehicle once"
-            raise missing_column(file, "t", frame, allowed)
+            raise missing_column(
+                file, "t", frame, "is needed; one of places alone has vehicle, x, y, each vehicle once"
+            )
         summary.assume("members of a table without times stand where it says, from the first instant on")
     if "vehicle" not in frame:
         frame = frame.assign(vehicle=path.stem)
@@ -125,8 +126,9 @@ def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str
     if "std" in frame and {KINDS[columns[name][0]].group for name in own} == {"fix"}:
         summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(own)}")
         frame = frame.assign(**{f"{name}_std": frame["std"] for name in own}).drop(columns="std")
-    used = ["t", "vehicle", "partner", *columns, *(f"{name}_std" for name in columns)]
-    for column in frame.columns.difference(used, sort=False):
+    for column in frame.columns.difference(
+        ["t", "vehicle", "partner", *columns, *(f"{name}_std" for name in columns)], sort=False
+    ):
         near = f"Did you mean {near}?" if (near := usual_key(column)) and "partner" not in frame else ""
         like = near or suggestion(column, (*LONG, *KINDS), "")
         if column == "std":
@@ -135,15 +137,19 @@ def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str
     parts = []
     for name, (kind, partner) in columns.items():
         needed = frame.columns.intersection(["t", "vehicle", "partner", name, f"{name}_std"])
-        cells = frame.loc[filled(frame[name]), needed].assign(kind=kind, **partner)
-        parts.append(_cells(cells, file, name, f"{name}_std"))
+        parts.append(
+            _cells(frame.loc[filled(frame[name]), needed].assign(kind=kind, **partner), file, name, f"{name}_std")
+        )
     return pd.concat(parts)
 
 
 def _of_partner(column: str) -> tuple[str, str] | None:
     """Kind and partner of a column such as range_car2 or azimuth_deg_car2; None for another."""
-    kinds = [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")]
-    kind = max(kinds, key=len, default="")
+    kind = max(
+        [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")],
+        key=len,
+        default="",
+    )
     partner = column[len(kind) + 1 :]
     is_column = not kind or column in KINDS or partner in UNIT_SUFFIXES or column.endswith("_std")
     return None if is_column else (kind, partner)

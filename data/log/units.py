@@ -140,8 +140,9 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     kind, value = own["kind"], own["value"]
     size, limit = value.abs(), kind.map(KIND_LIMITS)
     wrong = (size > limit) | (value < kind.map(LEAST_VALUES)) | ((kind == "range") & (value == 0.0))
-    usual = kind.map(size[~wrong].groupby(kind).max())
-    near = (size > limit) & (size <= LEAP_RATIO * usual)  # as of an angle in degrees
+    near = (size > limit) & (
+        size <= LEAP_RATIO * kind.map(size[~wrong].groupby(kind).max())
+    )  # as of an angle in degrees
     several = value[near].groupby(kind[near]).nunique()
     codes = own[wrong & ~kind.isin(several.index[several > 1])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= MOST_CODES) & (codes["size"] >= 2 * codes["nunique"])]
@@ -211,8 +212,10 @@ def distinct(rows: Rows, summary: "Summary") -> Rows:
     beside = rows["partner"].ne("") & ~of_pair
     rows = rows.assign(partner=rows["partner"].where(of_pair, ""))
     again = rows.duplicated(key) & (rows["kind"] != "message")
-    lost = again & ~(beside & rows.duplicated([*key, "value"]))
-    summary.refuse("repeated rows (same time, vehicle, kind and partner)", rows[lost])
+    summary.refuse(
+        "repeated rows (same time, vehicle, kind and partner)",
+        rows[again & ~(beside & rows.duplicated([*key, "value"]))],
+    )
     return rows[~again]
 
 
@@ -220,8 +223,9 @@ def fresh(rows: Rows, summary: "Summary") -> Rows:
     """Rows but fixes and relative measurements that only repeat the values before, where a table at the rate of another
     sensor holds them: where most runs of equal values are of two or more, and not all are equal."""
     keys, some = ["vehicle", "partner", "fix"], rows[in_group(rows, "fix", "relative")].sort_values("t", kind="stable")
-    same = some.groupby(["vehicle", "partner", "kind"])["value"].diff().eq(0)
-    some = some.assign(fix=in_group(some, "fix"), same=same)
+    some = some.assign(
+        fix=in_group(some, "fix"), same=some.groupby(["vehicle", "partner", "kind"])["value"].diff().eq(0)
+    )
     held = some.groupby([*keys, "t"])["same"].all()
     run = (~held).groupby(keys).cumsum()
     length = held.groupby([*keys, run.to_numpy()]).transform("size").where(~held).groupby(keys).transform("median")
