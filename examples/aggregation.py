@@ -27,7 +27,7 @@ from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.studies import lineup, scene
 from coopoc.studies.views import TableView, of, selections
-from coopoc.study.numbers import Where, across, interval, listed, mean, per_seed, present, seed_means
+from coopoc.study.numbers import Where, across, by_seed, interval, listed, mean, paired, seed_means
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
 from coopoc.world.fleet import Fleet
@@ -250,13 +250,14 @@ def _multiple(results: "Results", where: Where) -> list[float]:
 
 def _finding(results: "Results", at: dict[str, Any]) -> str:
     """RT-LE of the mean under a condition, and which rules are better or worse over all training seeds."""
-    plain = per_seed(results, {**at, "method": "mean"})
-    if not len(plain):
+    plain = by_seed(results, {**at, "method": "mean"})
+    if not plain:
         return ""
     better, worse = list[str](), list[str]()
     for rule in RULES[1:]:
-        if len(plain) > 1 and present(results, {**at, "method": rule}):
-            gap = over_seeds(per_seed(results, {**at, "method": rule}) - plain)
+        seeds = by_seed(results, {**at, "method": rule})
+        if len(seeds) == len(plain) > 1:
+            gap = over_seeds(np.subtract(*np.split(np.array(paired(results, "rt_le_m", *seeds, *plain)[0]), 2)))
             (better if gap.high < 0 else worse if gap.low > 0 else []).append(f"{rule} {gap.mean:+.3f} m")
     beside = {
         words: mean(results, {**at, "condition": "iid", "method": method})
@@ -264,7 +265,8 @@ def _finding(results: "Results", at: dict[str, Any]) -> str:
     }
     lists = [", ".join(rules) or "no rule" for rules in (better, worse)]
     return (
-        f"Scenario {at['scenario']}, {at['condition']}: {listed({'mean': float(plain.mean()), **beside})}. "
+        f"Scenario {at['scenario']}, {at['condition']}: "
+        f"{listed({'mean': mean(results, {**at, 'method': 'mean'}), **beside})}. "
         f"Better than the mean over training seeds (95 %): {lists[0]}; worse: {lists[1]}."
     )
 

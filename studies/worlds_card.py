@@ -182,16 +182,23 @@ def _frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def summary(scored: "pd.DataFrame") -> dict[str, Any]:
-    """Shares and means over worlds with 95 % bootstrap intervals, percentile, NEES and time.
+    """Shares in % with Wilson's and means with bootstrap 95 % intervals over worlds, percentile, NEES and time.
 
     Args:
         scored: worlds and their ratios.
     """
+    from scipy import stats
+
     sound, worse = scored[np.isfinite(scored["over_better"])], scored["over_better"] > WORSE_RATIO
     made: dict[str, Any] = {"worlds": len(scored), "failed": len(scored) - len(sound)}
-    made["worse_than_alone"] = _interval(100.0 * (scored["over_alone"] > WORSE_RATIO))
-    made["worse_than_better"] = _interval(100.0 * worse)
-    made["worse_unnoted"] = _interval(100.0 * (worse & (scored["noted"] == 0.0)))
+    shares = {
+        "worse_than_alone": scored["over_alone"] > WORSE_RATIO,
+        "worse_than_better": worse,
+        "worse_unnoted": worse & (scored["noted"] == 0.0),
+    }
+    for key, flags in shares.items():
+        ends = stats.binomtest(int(flags.sum()), len(flags)).proportion_ci(method="wilson")
+        made[key] = [_short(100.0 * float(share)) for share in (flags.mean(), *ends)]
     if len(sound):
         for key in ("over_joint", "over_better"):
             made[key] = [_short(float(np.exp(value))) for value in _interval(np.log(sound[key].clip(MIN_RATIO)))]

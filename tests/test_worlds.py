@@ -26,11 +26,8 @@ CHANGES = {
     "odometer scale, told": {"velocities", "sensors"},
     "odometer scale, not told": {"velocities"},
     "odometer slip": {"velocities"},
-    "no fixes": {"fixes of egos"},
-    "no fixes, at first": {"fixes of egos"},
-    "own receiver, jump": {"fixes of egos"},
-    "own receiver, creep": {"fixes of egos"},
-    "own receiver, from the start": {"fixes of egos"},
+    **{f"no fixes{at}": {"fixes of egos"} for at in ("", ", at first")},
+    **{f"own receiver, {how}": {"fixes of egos"} for how in ("jump", "creep", "from the start")},
     "multipath": {"fixes of egos", "fixes of others"},
     "NLOS": {"range"},
     "mistaken angles": {"azimuth", "inclination"},
@@ -194,7 +191,6 @@ def test_a_failed_world_is_worse_and_has_its_reason(tmp_path, capsys):
     (file,) = (tmp_path / "worlds").glob("*.json")
     card = json.loads(file.read_text())
     many = [str(seed) for seed in range(4) if world(seed).recording.v2x.max_neighbours > 2]
-    assert 0 < len(many) < 4
     assert card["failed"] == dict.fromkeys(many, "ValueError: too many neighbours")
     assert card["summary"]["worse_than_alone"][0] == 25 * len(many)
     assert card["summary"]["percentile_95"] is None
@@ -219,6 +215,7 @@ def test_nees_and_ratios_are_as_by_hand():
     one = world(2)
     tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter(), co.Kalman())]
     joint, alone = (co.rt_le(track, one.fleet).mean() for track in tracks)
+    assert card["summary"]["worse_than_alone"][1:]  # it has ends
     (ratio,) = card["summary"]["over_better"]
     assert ratio == pytest.approx(joint / min(joint, alone), rel=1e-4)
     gap = tracks[0].x - one.fleet.position[None, :, list(one.egos)]

@@ -79,49 +79,51 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     covariance = track.covariance
     if track.absent is not None:
         covariance = np.where(track.absent[..., None, None], np.eye(3), covariance)
-    squares, sound = normalised(*map(np.ascontiguousarray, (track.x, truth, covariance)))
+    squares = normalised(*map(np.ascontiguousarray, (track.x, truth, covariance)))
     _require_sound(track, covariance, squares, method)
-    if not sound:
-        hint = "Assume noise in every direction: no standard deviation may be zero."
-        raise InputError("covariance", "singular", "must have an inverse for NEES", hint)
     return squares
 
 
 def _require_sound(track: Track, p: Floats, square: Floats, method: str) -> None:
-    """InputError for the first covariance p (R, T, E, 3, 3) that gives a negative square (R, T, E), or is neither
-    symmetric nor positive semidefinite to a share of 1e-6."""
-    wrong = square < -1e-9
+    """InputError for the first covariance p (R, T, E, 3, 3) that gives a negative or infinite square (R, T, E), or is
+    neither symmetric nor positive semidefinite to a share of 1e-6."""
+    wrong = (square < -1e-9) | np.isinf(square)
     if any(UNSOUND in note for note in track.notes):
         own, skew = eigvalsh(np.nan_to_num(p))[..., 0], abs(p - p.mT).max(axis=(-1, -2))
         wrong |= np.minimum(own, -skew) < -1e-6 * abs(p).max(axis=(-1, -2))
     if wrong.any():
         run, step, ego = np.argwhere(wrong)[0]
         actual = f"{p[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
-        allowed = f"must be symmetric and positive semidefinite, and {method} returns another"
-        raise InputError("covariance", actual, allowed, "Return (P + P.T) / 2; its eigenvalues are variances, m^2.")
+        allowed = f"must be symmetric and positive semidefinite, for NEES without a zero, and {method} returns another"
+        hint = "Return (P + P.T) / 2; its eigenvalues are variances, m^2: assume noise in every direction."
+        raise InputError("covariance", actual, allowed, hint)
 
 
-def nees_band(runs: int) -> tuple[float, float]:
+def nees_band(runs: int, degrees: int = 3) -> tuple[float, float]:
     """Two-sided 99 % chi-square band of the run-averaged NEES of one step, for `runs` runs (Bar-Shalom, section 5.4).
 
     Steps of one run are not independent, so the band is of each step's average over runs, never of a pool of steps.
+
+    Args:
+        runs: that were averaged.
+        degrees: of freedom, 2 in the plane (see `dimensions`).
 
     >>> [round(b, 2) for b in nees_band(30)]
     [1.97, 4.28]
     """
     runs = number("runs", runs, 1, kind=int, allowed=">= 1", hint="Give the number of runs averaged.")
-    low, high = special.chdtri(3 * runs, [0.995, 0.005]) / runs
+    low, high = special.chdtri(degrees * runs, [0.995, 0.005]) / runs
     return float(low), float(high)
 
 
-def share_of_average(average: Floats, runs: int) -> Floats:
-    """Share (E,) of the steps at which the average over `runs` runs of what `nees` has found, (T, E), lies in the band;
-    >= 0.95 passes the consistency gate. NaN does not count.
+def share_of_average(average: Floats, runs: int, degrees: int = 3) -> Floats:
+    """Share (E,) of the steps at which the average over `runs` runs of what `nees` has found, (T, E), lies in its
+    `nees_band`; >= 0.95 passes the consistency gate. NaN does not count.
 
     >>> share_of_average(np.array([[3.0], [9.0]]), 30)
     array([0.5])
     """
-    low, high = nees_band(runs)
+    low, high = nees_band(runs, degrees)
     return np.asarray(np.nanmean(np.where(np.isnan(average), nan, (average >= low) & (average <= high)), axis=0))
 
 

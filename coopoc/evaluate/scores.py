@@ -11,7 +11,7 @@ from ..methods.track import Method, Track, far_off, follow, needs_fix
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles
 from .ledger import Kind, Way, of_track
-from .metrics import errors, innovation_columns, max_error, measure, nees, rt_le, share_of_average
+from .metrics import METRICS, dimensions, errors, innovation_columns, max_error, measure, nees, rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
@@ -19,6 +19,9 @@ BYTES: Mapping[str, tuple[Kind, Way]] = {
     "payload_bytes_per_second": ("payload", "per receiver"),
 }
 """Columns of rows with the bytes of online cooperation, as a ledger counts them."""
+COLUMNS = {"rt_le_m", "max_error_m", "error_quantiles_m", "nees", "nees_inside", "left_fixes", "seconds", *BYTES}
+COLUMNS |= {"run", "ego", "label", "train_seed"}
+"""Columns of rows that no metric of one's own may have."""
 SLAB = 2**25
 """Bytes of a Track, about: runs are scored while the cache still holds them, and memory does not grow with the number
 of runs."""
@@ -50,7 +53,7 @@ def scored(
         egos: ids.
         drive: the truth.
         quantiles: number of quantiles of the distances.
-        metric: one more, by its name or "mine.py:NAME"; "" for none.
+        metric: one more, by its name or "mine.py:NAME", which is none of COLUMNS; "" for none.
 
     Returns:
         Columns (R, E): RT-LE and largest error in m; the rates of BYTES; `left_fixes`, 1 or 0; `nees` and
@@ -61,7 +64,13 @@ def scored(
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
     >>> scored(GNSS(), observe(fleet, Sensors(), runs=3), ["a"], fleet)["rt_le_m"].shape
     (3, 1)
+    >>> scored(GNSS(), observe(fleet, Sensors()), ["a"], fleet, metric="mine.py:nees")
+    Traceback (most recent call last):
+    coopoc.errors.InputError: metric = 'mine.py:nees': must not have the name of a column of every study. Rename it.
     """
+    column = metric.rpartition(":")[2]
+    if column in COLUMNS and metric not in METRICS:
+        raise InputError("metric", repr(metric), "must not have the name of a column of every study", "Rename it.")
     seconds, parts, squares = 0.0, [], []
     there = recording.present[:, [recording.ids.index(ego) for ego in egos]]
     has_truth = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(0).all())
@@ -86,7 +95,7 @@ def scored(
             made["error_quantiles_m"] = np.moveaxis(quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1)
         made |= online_columns(track, part, method)
         if metric:
-            made[metric.rpartition(":")[2]] = measure(metric, track, drive)
+            made[column] = measure(metric, track, drive)
         if track.covariance is not None:
             each = nees(track, drive, method=method.name)
             made["nees"] = np.nanmean(each, 1)
@@ -96,7 +105,8 @@ def scored(
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
     more: dict[str, Any] = {"seconds": seconds / recording.runs / served}
     if squares:
-        more["nees_inside"] = share_of_average(np.sum(squares, 0) / recording.runs, recording.runs)
+        average, degrees = np.sum(squares, 0) / recording.runs, dimensions(recording)
+        more["nees_inside"] = share_of_average(average, recording.runs, degrees)
     return {**{name: np.broadcast_to(value, columns["left_fixes"].shape) for name, value in more.items()}, **columns}
 
 

@@ -41,17 +41,16 @@ def unsound(cov: Floats) -> int:
 
 
 @compiled
-def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
-    """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero or the truth is unknown, and whether every other
-    P could be inverted, but for a height without error."""
-    squares, sound = np.empty(x.shape[0] * x.shape[1] * x.shape[2]), True
+def normalised(x: Floats, truth: Floats, cov: Floats) -> Floats:
+    """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero or the truth is unknown, infinite where another P has
+    no inverse, but for a height without error."""
+    squares = np.empty(x.shape[0] * x.shape[1] * x.shape[2])
     for i in range(len(squares)):
         p, error = block_at(cov, i), subtract(vector_at(x, i), vector_at(truth, i % (truth.size // 3)))
         squares[i] = distance(p, error)[0]
         if not isfinite(squares[i]):
-            sound &= isnan(error[0]) or p == BLOCK
-            squares[i] = np.nan
-    return squares.reshape(x.shape[:3]), sound
+            squares[i] = np.nan if isnan(error[0]) or p == BLOCK else np.inf
+    return squares.reshape(x.shape[:3])
 
 
 @compiled

@@ -12,7 +12,7 @@ from ..evaluate.statistics import Interval
 from ..text import picture
 from .numbers import Number, Results, Where, interval, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
-from .style import Panel, look, words
+from .style import Panel, label, look, words
 
 __all__ = ["Plot", "curves", "pareto", "sweep"]
 
@@ -24,16 +24,26 @@ def sweep(results: Results, x: str, where: Where | None = None, caption: str = "
 
     Args:
         results: of the study.
-        x: column of the horizontal axis.
+        x: column of the horizontal axis; its values are evenly spaced if a word or None is among them.
         where: column -> value or values.
         caption: under the figure; default the metric and the axis.
         log: logarithmic vertical axis.
 
     Raises:
         InputError: as `Results.summary`.
+
+    >>> from pandas import DataFrame
+    >>> from coopoc.study.results import Results
+    >>> frame = DataFrame({"method": "okf", "weather": ["$rain", None], "ego": "e", "run": 0, "rt_le_m": [1.0, 2.0]})
+    >>> axes = sweep(Results("s", "?", (), {}, frame, frame[:0], 0, {}), "weather").figure.axes[0]
+    >>> [text.get_text() for text in axes.get_xticklabels()], axes.lines[0].get_xdata(orig=False).tolist()
+    (['\\\\$rain', 'None'], [0.0, 1.0])
     """
     rows = results.select(where)
-    panel = Panel({value: {x: value} for value in sorted(rows[x].unique())}, dict(where or {}), xlabel=words(x))
+    values = [None if value != value else value for value in rows[x].sort_values().unique()]
+    named = any(isinstance(value, str | None) for value in values)
+    places = {picture(label(x, value, values)) if named else value: {x: value} for value in values}
+    panel = Panel(places, dict(where or {}), xlabel=words(x))
     names = _line_names(results, x)
     lines = [dict(zip(names, line, strict=True)) for line in rows[names].drop_duplicates().itertuples(index=False)]
     text = caption or f"{words('rt_le_m')} against {words(x)}. Bands: 95 % intervals over egos, then runs."
@@ -132,11 +142,11 @@ def curves(
     for panel in panels:
         drawn = []
         for of in lines:
-            points = {x: number(results, {**panel.where, **also, **_where(of)}) for x, also in panel.x.items()}
-            drawn += [(of, ran(points))] if ran(points) else []
+            points = ran({x: number(results, {**panel.where, **also, **_where(of)}) for x, also in panel.x.items()})
+            drawn += [(of, points)] if points else []
         if drawn or len(panels) == 1:
-            flat = [(of, number(results, {**panel.where, **_where(of)})) for of in levels]
-            shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
+            flat = [(of, y) for of in levels if (y := number(results, {**panel.where, **_where(of)})) is not None]
+            shown.append((panel, [*drawn, *flat]))
     if not any(drawn for _, drawn in shown):
         return None
     coinciding, near = _coinciding(shown, log)
@@ -167,7 +177,8 @@ def curves(
             if logx:
                 plain_log(axis.xaxis)
             if panel.ticks or len(panel.x) <= 8:
-                axis.set_xticks(list(panel.ticks or panel.x), list(panel.ticks.values()) or [f"{x:g}" for x in panel.x])
+                ticks = panel.ticks or {x: label("", x) for x in panel.x}
+                axis.set_xticks([*ticks], [*ticks.values()])
                 axis.minorticks_off()
         axes[0].set_ylabel(ylabel)
         if log:

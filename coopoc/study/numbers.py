@@ -59,12 +59,20 @@ def rms(results: Results, where: Where) -> float | None:
     return float(np.sqrt(squares).mean())
 
 
+def paired(results: Results, value: str, *wheres: Where) -> tuple[list[Floats], int]:
+    """(R, E) of a metric of each selection for the egos and runs that all of them have, nothing if there are none, and
+    how many others any of them has."""
+    from .results import whole
+
+    grids = [results.grid(value, where) for where in wheres]
+    union = sum(grids[1:], grids[0])
+    kept = whole(union)
+    return [grid.loc[kept.index, kept.columns].to_numpy().T for grid in grids if kept.size], union.size - kept.size
+
+
 def difference(results: Results, method: Where, base: Where) -> Interval | None:
-    """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where either was not run."""
-    first, second = present(results, method), present(results, base)
-    if first is None or second is None:
-        return None
-    return paired_difference(results.values("rt_le_m", first), results.values("rt_le_m", second))
+    """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where no pair was run."""
+    return next(iter(gaps(results, method, base).values()), None)
 
 
 def across(number: Number, selections: Mapping[str, Where]) -> dict[str, Number]:
@@ -108,28 +116,26 @@ def listed(numbers: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
-def _seeds(results: Results, where: Where, value: str = "rt_le_m") -> list[Any]:
-    kept = present(results, where, value)
-    frame = results.select(kept) if kept else results.frame.iloc[:0]
-    return sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
-
-
-def per_seed(results: Results, where: Where, value: str = "rt_le_m") -> Floats:
-    """(S, R, E) of a metric for each training seed; S = 0 for a method that is not trained."""
-    seeds = _seeds(results, where, value)
-    return np.array([results.values(value, {**where, "train_seed": seed}) for seed in seeds])
+def by_seed(results: Results, where: Where, value: str = "rt_le_m") -> list[Where]:
+    """The selection of each training seed; of a method that is not trained its own, and none if it was not run."""
+    if (kept := present(results, where, value)) is None:
+        return []
+    rows = results.select(kept)
+    seeds = sorted(rows["train_seed"].dropna().unique()) if "train_seed" in rows else []
+    return [{**kept, "train_seed": seed} for seed in seeds] or [kept]
 
 
 def seed_means(results: Results, where: Where) -> list[float]:
-    """Mean RT-LE for each training seed, m; of a method that is not trained one, and none if it was not run."""
-    wheres = [{**where, "train_seed": seed} for seed in _seeds(results, where)] or [dict(where)]
-    return [value for each in wheres if (value := mean(results, each)) is not None]
+    """Mean RT-LE for each training seed over the egos and runs that all have, m; of a method that is not trained one,
+    and none if it was not run."""
+    wheres = by_seed(results, where)
+    return [float(values.mean()) for values in paired(results, "rt_le_m", *wheres)[0]] if wheres else []
 
 
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
-    each = per_seed(results, where)
-    return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
+    each = seed_means(results, where)
+    return float(np.std(each, ddof=1)) if len(each) > 1 else None
 
 
 def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
@@ -140,21 +146,33 @@ def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
         first: selection of one method.
         second: selection of another one, over the same egos and runs.
         value: the metric.
+
+    >>> from pandas import DataFrame
+    >>> from coopoc.study.results import Results
+    >>> runs, errors = [0, 1, 2, 1, 2, 1, 2, 3], [9.0, 2.0, 3.0, 2.0, 3.0, 1.0, 2.0, 9.0]
+    >>> frame = DataFrame({"method": [*"aaaaabbb"], "ego": "e", "run": runs, "rt_le_m": errors})
+    >>> frame["train_seed"] = [0, 0, 0, 1, 1, None, None, None]
+    >>> both = gaps(Results("s", "?", (), {}, frame, frame[:0], 0, {}), {"method": "a"}, {"method": "b"})
+    >>> [f"{gap} {over}" for over, gap in both.items()]
+    ['1 [1, 1] over egos and runs, but 2 pairs that lack a value', '1 [1, 1] over 2 training seeds']
     """
-    each, base = per_seed(results, first, value), results.values(value, second)
-    intervals = {"over egos and runs": paired_difference(results.values(value, first), base)}
+    seeds, base = by_seed(results, first, value), present(results, second, value)
+    values, lost = paired(results, value, *seeds, base) if seeds and base is not None else ([], 0)
+    if not values:
+        return {}
+    *each, kept = values
+    left_out = f", but {lost} pairs that lack a value" if lost else ""
+    intervals = {f"over egos and runs{left_out}": paired_difference(np.mean(each, axis=0), kept)}
     if len(each) > 1:
-        intervals[f"over {len(each)} training seeds"] = over_seeds(each - base)
+        intervals[f"over {len(each)} training seeds"] = over_seeds(np.array(each) - kept)
     return intervals
 
 
 def alike(results: Results, first: Where, second: Where, value: str) -> bool:
-    """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or egos or
-    runs are others, so that there is none."""
-    if results.values(value, first).shape != results.values(value, second).shape:
-        return True
-    both = {**gaps(results, first, second, value), **gaps(results, second, first, value)}
-    return any(gap.low <= 0 <= gap.high for gap in both.values())
+    """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or there is
+    none, as they share no ego and run."""
+    both = *gaps(results, first, second, value).values(), *gaps(results, second, first, value).values()
+    return not both or any(gap.low <= 0 <= gap.high for gap in both)
 
 
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
@@ -167,10 +185,13 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
         name: of the other, for the sentence.
     """
     intervals = gaps(results, trained, other)
+    if not intervals:
+        return f"cannot be compared with {name}: they share no ego and run"
     ends = np.array([(gap.low, gap.high) for gap in intervals.values()])
     claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
     evidence = ", ".join(
         f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in intervals.items()
     )
-    one = " of one training seed, whose spread is unknown" * (len(_seeds(results, trained)) == 1)
+    single = len(intervals) == 1 and present(results, trained, "train_seed") is not None
+    one = " of one training seed, whose spread is unknown" * single
     return f"{claim} {name} (paired difference {evidence}{one})"

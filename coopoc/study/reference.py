@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import pandas as pd
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
@@ -18,7 +17,7 @@ from ..evaluate.statistics import Interval
 from ..paths import given_path, write
 from ..plugins import names
 from . import store
-from .results import SEED, Results, ego_by_run
+from .results import SEED, Results, ego_by_run, whole
 from .study import Params, find_study
 from .style import label, words
 from .tables import Entry, Table
@@ -143,7 +142,7 @@ def measure(results: Results, metrics: Iterable[str]) -> Reference:
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
         tolerance = TRAINED_TOLERANCE if SEED in rows and rows[SEED].notna().any() else PAIRED_TOLERANCE
         for metric in metrics:
-            each = ego_by_run(rows, metric)[0] if metric in rows else np.empty(0)
+            each = whole(ego_by_run(rows, metric)).to_numpy() if metric in rows else np.empty((0, 0))
             if each.size:
                 runs = each.shape[1]
                 std = each.mean(axis=0).std(ddof=1) if runs > 1 else 0.0
@@ -179,16 +178,20 @@ def check(results: Results, reference: Reference, metrics: Mapping[str, str | fl
     return changes
 
 
-def table(changes: Sequence[Change], everything: bool = False) -> Table:
-    """The numbers that have moved, or all; the caption says how many hold, and how many are worse or better.
+def table(changes: Sequence[Change], everything: bool = False, missing: int = 0) -> Table:
+    """The numbers that have moved, or all; the caption says how many hold, and how many do not.
 
     Args:
         changes: of `check`.
         everything: show the numbers that hold, too.
+        missing: number of reference numbers without a value.
+
+    >>> table([], missing=4).caption
+    '0 of 4 reference numbers hold; 4 without a value.'
     """
-    counts = Counter(change.verdict for change in changes)
-    moved = [f"; {counts[word]} {word}" for word in ("worse", "better") if counts[word]]
-    text = f"{counts['within noise']} of {len(changes)} reference numbers hold{''.join(moved)}."
+    counts = Counter(change.verdict for change in changes) + Counter({"without a value": missing})
+    moved = [f"; {counts[word]} {word}" for word in ("worse", "better", "without a value") if counts[word]]
+    text = f"{counts['within noise']} of {counts.total()} reference numbers hold{''.join(moved)}."
     shown = [change for change in changes if everything or change.verdict != "within noise"]
     names = [*dict.fromkeys(name for change in shown for name in change.was.where), "metric"]
     header = (*map(words, names), "Reference", "Now", "Now - Reference", "Change")
@@ -208,7 +211,8 @@ def reference(
     write: bool = False,
     all: bool = False,
 ) -> int:
-    """Check the results of a study against its committed reference values; the status is 1 if one is worse.
+    """Check the results of a study against its committed reference values; the status is 1 if one is worse, cells
+    failed, or no number has a value.
 
     Example: coopoc reference runs/budget
 
@@ -236,15 +240,14 @@ def reference(
         made.save(file)
         print(f"coopoc: {len(made.numbers)} numbers are in {file}", file=sys.stderr)
         return 0
-    changes = check(results, Reference.load(file), of.metrics)
-    shown = table(changes, everything=all)
+    known = Reference.load(file)
+    changes = check(results, known, of.metrics)
+    shown = table(changes, all, len(known.numbers) - len(changes))
     print(shown.to_markdown() if shown.rows else shown.caption)
-    return int(any(change.verdict == "worse" for change in changes))
+    return int(not changes or results.failed > 0 or any(change.verdict == "worse" for change in changes))
 
 
 def plain(value: Any) -> Any:
     """A parameter as JSON has it: Python's own number, None for NaN, a list for a tuple."""
     value = value.item() if isinstance(value, np.generic) else value
-    if value is pd.NA or (isinstance(value, float) and math.isnan(value)):
-        return None
-    return list(value) if isinstance(value, tuple) else value
+    return None if value != value else list(value) if isinstance(value, tuple) else value

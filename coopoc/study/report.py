@@ -15,7 +15,7 @@ from ..text import uncontrolled
 from .publish import views
 from .results import Results
 from .store import environments
-from .style import look, title, words
+from .style import label, look, title, words
 from .tables import Table
 
 TEMPLATES = Path(__file__).parent
@@ -123,6 +123,4 @@ def _named(field: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return ", ".join(map(_shown, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return ", ".join(map(_shown, value)) if isinstance(value, list | tuple) else label("", value)

@@ -105,11 +105,15 @@ class Results:
             frame = frame[np.logical_or.reduce([_is(frame[name], v) for v in values])]
         return frame
 
-    def values(self, value: str, where: Params | None = None, **also: Any) -> Floats:
-        """(R, E) of one metric for paired comparisons, sorted by run and ego, averaged over training seeds."""
+    def grid(self, value: str, where: Params | None = None, **also: Any) -> DataFrame:
+        """Egos x runs of one metric, averaged over training seeds; NaN where a run or a seed has none."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
-        grid = ego_by_run(frame, value)[0]
+        return ego_by_run(frame, value)
+
+    def values(self, value: str, where: Params | None = None, **also: Any) -> Floats:
+        """(R, E) of one metric, sorted by run and ego, averaged over training seeds; see `numbers.paired` for pairs."""
+        grid = whole(self.grid(value, where, **also)).to_numpy()
         if grid.size == 0:
             raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
         return grid.T
@@ -140,9 +144,10 @@ class Results:
         rows = []
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
-            grid, missing = ego_by_run(frame, value)
-            each = mean_interval(grid.T) if grid.size else NO_VALUES
-            rows.append([*names, each.mean, each.low, each.high, each.n, missing])
+            table = ego_by_run(frame, value)
+            grid = whole(table)
+            each = mean_interval(grid.to_numpy().T) if grid.size else NO_VALUES
+            rows.append([*names, *vars(each).values(), len(table) - len(grid)])
         return DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
     def _one_cell(self, frame: DataFrame, by: Sequence[str], value: str) -> None:
@@ -157,20 +162,29 @@ class Results:
 
 
 def _is(column: "pd.Series[Any]", value: Any) -> "pd.Series[bool]":
-    return column.isna() if value is None else column == value
+    return column.isna() if pd.isna(value) else column == value
 
 
 def _joined(tables: Sequence[pa.Table]) -> DataFrame:
-    return pa.concat_tables(tables, promote_options="permissive").to_pandas() if tables else DataFrame()
+    try:
+        return pa.concat_tables(tables, promote_options="permissive").to_pandas() if tables else DataFrame()
+    except pa.ArrowTypeError as error:
+        hint = "Let every cell return the same type, and repeat coopoc run."
+        raise InputError("results", str(error), "must have one type in each column", hint) from None
 
 
-def ego_by_run(frame: DataFrame, value: str) -> tuple[Floats, int]:
-    """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing.
+def ego_by_run(frame: DataFrame, value: str) -> DataFrame:
+    """Egos x runs: means over training seeds, NaN where a seed has none; rows without ego or run count as one.
 
-    A run without a value of any ego is left out.
+    >>> ego_by_run(DataFrame({"x": [1.0, 3.0], "run": [None, None]}), "x").to_numpy().tolist()
+    [[2.0]]
     """
-    frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame}, _value=frame[value].astype(float))
-    cells = frame.groupby(["ego", "run"])["_value"]
-    table = cells.mean().where(cells.count() == cells.size()).unstack("run")
-    whole = table.dropna(axis="columns", how="all").dropna()
-    return whole.to_numpy(dtype=float), len(table) - len(whole) if frame["_value"].notna().any() else 0
+    keys = frame.reindex(columns=["ego", "run"])
+    keys = keys.astype(object).where(keys.notna(), 0)
+    cells = frame[value].astype(float).groupby([keys["ego"], keys["run"]])
+    return cells.mean().where(cells.count() == cells.size()).unstack("run")
+
+
+def whole(table: DataFrame) -> DataFrame:
+    """The egos with a value in every run in which any has one."""
+    return table.dropna(axis="columns", how="all").dropna()

@@ -112,7 +112,16 @@ class Study:
         return {name: list(dict.fromkeys(p[name] for p in self.grid if name in p)) for name in names}
 
     def cells(self) -> list[Cell]:
-        """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
+        """All cells in the order of the grid, each named by the hash of all that changes its numbers.
+
+        >>> Study("demo", "?", cell=dict, grid={"x": ("off", 0.5)}).cells()
+        Traceback (most recent call last):
+        coopoc.errors.InputError: x = ['off', 0.5]: must be numbers, words or bools, as a column has one type. ...
+        """
+        for name, values in self.values().items():
+            if len({(isinstance(v, str), isinstance(v, bool)) for v in values if v is not None}) > 1:
+                hint = "Write the numbers as words, too."
+                raise InputError(name, values, "must be numbers, words or bools, as a column has one type", hint)
         code = cache(lambda: self.cell.code if isinstance(self.cell, _FileCell) else code_of(self.cell))
         cells = [_named(self, params, code) for params in points(self)]
         if not cells:

@@ -2,7 +2,7 @@
 
 import tomllib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,25 +95,26 @@ def words(name: str) -> str:
     return f"{text} [{unit}]" if unit else text
 
 
-def title(column: str, value: object) -> str:
-    """Title over a column of numbers.
+def title(column: str, value: object, among: Iterable[object] = ()) -> str:
+    """Title over a column of numbers, told apart as by `label`.
 
     >>> title("max_neighbours", 4), title("method", "okf")
     ('K = 4', 'OKF')
     """
+    text = label(column, value, among)
     if column in ("method", "noise_model"):
-        return label(column, value)
-    return f"{'K' if column == 'max_neighbours' else words(column)} = {label(column, value)}"
+        return text
+    return f"{'K' if column == 'max_neighbours' else words(column)} = {text}"
 
 
-def label(column: str, value: object) -> str:
-    """A parameter's value as words: methods by their label, whole floats without point.
+def label(column: str, value: object, among: Iterable[object] = ()) -> str:
+    """A parameter's value as words: methods by their label, whole floats without point; the value itself where another
+    one `among` has the same words.
 
-    >>> label("method", "okf"), label("max_neighbours", 4.0)
-    ('OKF', '4')
+    >>> label("method", "okf"), label("max_neighbours", 4.0), label("x", 1.0000001, [1.0, 1.0000001])
+    ('OKF', '4', '1.0000001')
     """
-    if column == "method":
-        return look(str(value)).label
-    if isinstance(value, float):
-        return f"{value:g}"
-    return str(value)
+    if value != value:  # what a column of floats has for None
+        return "None"
+    text = look(str(value)).label if column == "method" else f"{value:g}" if isinstance(value, float) else str(value)
+    return str(value) if any(other != value and label(column, other) == text for other in among) else text

@@ -234,9 +234,9 @@ def pivot(
     down = [name for name in down if name not in same] or down[:1]
     titles, of = dict[str, None](), dict[tuple[Entry, ...], dict[str, Any]]()
     for row in summary.to_dict("records"):
-        text = ", ".join(title(name, row[name]) for name in across)
+        text = ", ".join(title(name, row[name], summary[name].unique()) for name in across)
         titles[text] = None
-        of.setdefault(tuple(label(name, row[name]) for name in down), {})[text] = row
+        of.setdefault(tuple(label(name, row[name], summary[name].unique()) for name in down), {})[text] = row
     body = []
     for labels in sorted(of, key=smooths):
         matches = (of[labels].get(text) for text in titles)
@@ -282,7 +282,7 @@ def smooths(labels: Iterable[object]) -> bool:
 
 def lost(results: Results, where: Where | None = None) -> list[str]:
     """A sentence for each method whose estimates left the fixes by more than 100 standard deviations."""
-    frame = results.select(where or {})
+    frame = results.select(where)
     if "left_fixes" not in frame or "method" not in frame:
         return []
     runs = frame.groupby("method", sort=False)["left_fixes"].agg(lambda flags: int((flags > 0).sum()))
