@@ -10,7 +10,6 @@ from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import quote
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -100,7 +99,6 @@ def benchmark(
     failed = 0
     for name in methods:
         began, file = time.perf_counter(), card_file(name, out, seed, validation)
-        file = file.with_name(f"{quote(name, safe='')}.json")
         made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
         write(file, json.dumps(made, indent=1) + "\n")

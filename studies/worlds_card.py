@@ -1,13 +1,13 @@
 """Score card of a method on worlds: how often and by how much it is worse than being alone or a textbook filter."""
 
 import json
-import re
 import sys
 import time
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 from scipy import special
@@ -115,7 +115,7 @@ def card_file(name: str, out: Path, seed: int | None, validation: bool) -> Path:
     """File of a method's card; in folders of their own those of other draws and of validation, which cannot be
     submitted."""
     folder = made_folder(out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}"))
-    return folder / f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
+    return folder / f"{quote(name, safe='')}.json"
 
 
 def card_head(name: str) -> Row:

@@ -10,7 +10,7 @@ from numpy import inf, nan
 from numpy.linalg import norm
 
 from ..arrays import Bools, Floats, Ints, instance, last_true, one_of, runs_in_memory, seed_of
-from ..errors import InputError
+from ..errors import InputError, shown
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
 from .fleet import Fleet, columns, interval
@@ -22,8 +22,8 @@ from .v2x import V2X
 Frame = Literal["world", "body"]
 Pairs = Sequence[tuple[str, str, Ints, Ints]]
 """Observer id, neighbour id, indices of its links, and their steps."""
-PAIRS_AT_ONCE = 2_000_000
-"""Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
+SECONDS, PAIRS_AT_ONCE = 5.0, 2_000_000
+"""s over which positions are held against velocities; pairs of vehicles looked at in one go, to bound the memory."""
 
 
 def observe(
@@ -86,9 +86,8 @@ def observe(
     relative = _relative_measurements(fleet, links, sensors, v2x, runs, seed, remove_outliers)
     body, moved = None, fleet.velocity
     notes = [f"{note}{', removed' * remove_outliers}" for note in (sensors.outliers.notes if sensors.outliers else ())]
-    # By more than stops within long steps explain, and 0.5 m/s.
-    if np.nansum(abs(np.diff(fleet.position, axis=0) / fleet.dt - moved[1:])) > np.nansum(abs(moved) + 0.5):
-        notes.append("velocities of the fleet contradict its positions: they are in m/s, of the same instants")
+    if strange := _contradictory(fleet):
+        notes.append(f"velocities of {shown(strange)} contradict positions: they are in m/s, of the same instants")
     if frame == "world":
         velocity = _noisy(fleet, "velocity", runs, seed, moved, sensors.velocity_std(moved))
     else:
@@ -171,6 +170,18 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
     observers, everyone = (KDTree(each, 32, False, balanced_tree=False) for each in (tagged[looks], tagged))
     pairs = observers.sparse_distance_matrix(everyone, reach, output_type="ndarray")
     return here[looks][pairs["i"]], here[pairs["j"]]
+
+
+def _contradictory(fleet: Fleet) -> list[str]:
+    """Vehicles whose ways over SECONDS differ from the integrals of their velocities by more than a tenth, of turns and
+    stops within steps, too, and 0.1 m/s on average."""
+    if len(fleet.t) < 2:
+        return []
+    ways, u, dt = np.diff(fleet.position, axis=0), fleet.velocity, fleet.dt
+    gaps = np.nan_to_num(ways - 0.5 * dt * (u[1:] + u[:-1]))
+    gaps = np.add.reduceat(gaps, np.arange(0, len(gaps), int(SECONDS / dt) + 1))
+    allowed = 0.1 * np.nansum(abs(ways) + dt + dt * abs(u[1:] - u[:-1]), (0, 2))
+    return [fleet.ids[k] for k in np.flatnonzero(abs(gaps).sum((0, 2)) > allowed)]
 
 
 def _noisy(fleet: Fleet, sensor: str, runs: int, seed: int, mean: Floats, std: Floats) -> Floats:
