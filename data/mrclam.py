@@ -250,9 +250,8 @@ def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     finite = np.isfinite(true)
     parts = (np.where(finite, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
     sums = [part.reshape(-1, window, true.shape[1]).sum(1).T for part in parts]
-    return np.array(
-        [np.linalg.lstsq(left, right)[0] for left, right in zip(np.stack(sums[1:], -1), sums[0], strict=True)]
-    ).T
+    pairs = zip(np.stack(sums[1:], -1), sums[0], strict=True)
+    return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
 
 
 def grouped(error: Floats, observer: Floats | Ints, t: Floats, gate: float = inf) -> float:

@@ -41,12 +41,11 @@ def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
         for drive in torch.load(path, map_location="cpu", weights_only=True):
             arrays = {name: np.asarray(drive[name], float)[:, :n] for name, n in FIELDS.items()}
             date, (x, y), (true_x, true_y) = drive["data_date"], arrays["filtered_gps"].T, arrays["ground_truth"].T
-            table = pd.DataFrame({"t": np.arange(len(x)), "x": x, "y": y, "speed": arrays["filtered_wheel"].mean(1)})
+            speed = arrays["filtered_wheel"].mean(1)
+            table = pd.DataFrame({"t": np.arange(len(x)), "x": x, "y": y, "speed": speed})
             truth = table[["t"]].assign(x=true_x, y=true_y, true=1.0)
-            for name, heading in {
-                date: arrays["imu_sensor"][:, 2],
-                f"{date}-true-heading": arrays["theta_gt"][:, 0],
-            }.items():
+            headings = {date: arrays["imu_sensor"][:, 2], f"{date}-true-heading": arrays["theta_gt"][:, 0]}
+            for name, heading in headings.items():
                 parts += [table.assign(heading=heading, vehicle=name), truth.assign(vehicle=name)]
         frame = pd.concat(parts, ignore_index=True)
     except Exception as error:  # of torch, NumPy and pandas: another file meets them all

@@ -135,9 +135,8 @@ def _failing(c: Check) -> dict[str, str]:
 def _wider(c: Check) -> Check:
     """The same, where fixes err by more than is stated: so do the positions of these vehicles."""
     links, nis = c.world.links, {row["vehicle"]: row["nis"] for row in c.vehicles if _beyond(row, "nis", OUTLYING)}
-    more = np.array([nis.get(name, 1.0) for name in c.world.ids])[np.stack([links.observer, links.neighbour])].mean(0)[
-        :, None
-    ]
+    factor = np.array([nis.get(name, 1.0) for name in c.world.ids])
+    more = factor[np.stack([links.observer, links.neighbour])].mean(0)[:, None]
     noise = np.square(c.world.sensors.relative_std)
     return replace(c, expected=np.sqrt((c.expected**2 - noise) * more + noise))
 
@@ -508,9 +507,8 @@ def _unseen(c: Check) -> Iterator[str]:
     if c.log.recording.body is not None:
         turns = ("yaw_rate_bias", LEAST_DRIFT, "rad/s, of the yaw rates")
     for name, least, what in (("speed_excess", LEAST_SCALE, "as a share, of the speeds"), turns):
-        if blind := _below(
-            {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", inf) for row in c.vehicles}, 2 * least
-        ):
+        errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", inf) for row in c.vehicles}
+        if blind := _below(errors, 2 * least):
             yield f"errors, {what} of {blind}"
     late = {row["vehicle"]: row.get("late_s_error", inf) for row in c.vehicles}
     if blind := _below(

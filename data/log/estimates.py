@@ -176,9 +176,8 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
 def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     """What is of each step, of the one two samples of the odometry later, as two steps may share one; the last at the
     end."""
-    return of_step.take(
-        np.arange(of_step.shape[axis]) + 2 * max(round(c.log.summary.odometry / c.world.dt), 1), axis, mode="clip"
-    )
+    at = np.arange(of_step.shape[axis]) + 2 * max(round(c.log.summary.odometry / c.world.dt), 1)
+    return of_step.take(at, axis, mode="clip")
 
 
 def moves(c: Check, column: int, means: int = 1) -> AnyArray:

@@ -180,9 +180,8 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
             "which is another. Read each place alone (since=, until=, or a folder each), with an origin= near it",
             name,
         )
-    value = rows["value"].mask(
-        geodetic, pd.DataFrame(metres, fixes.index, [*ENU]).stack().reindex(rows.set_index(keys).index).to_numpy()
-    )
+    enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
+    value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(keys).index).to_numpy())
     lost = geodetic & value.isna()
     summary.refuse("incomplete fixes, without latitude or longitude", rows[lost])
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[~lost], origin

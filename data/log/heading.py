@@ -110,11 +110,8 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     sampled = heading.t if yaw_rate is None else yaw_rate.t
 
     def at(times: Floats) -> Floats:
-        return np.where(
-            covered(sampled, times, gap, gap / 2),
-            wrap(np.interp(times, heading.t, offset) + _angle(yaw_rate, times)),
-            nan,
-        )
+        angle = wrap(np.interp(times, heading.t, offset) + _angle(yaw_rate, times))
+        return np.where(covered(sampled, times, gap, gap / 2), angle, nan)
 
     return at
 

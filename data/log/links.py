@@ -44,20 +44,16 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     summary, sent = steps.summary, only(rows, "message")
     measured = _measured(rows, members, there, steps)
     if mutual:
-        far = measured[
-            (measured["component"] == 0)
-            & ~np.array([member.stands for member in members.values()])[measured["neighbour"]]
-        ]
-        reached = far.set_index(LINK_COLUMNS).index.isin(
-            measured[measured["component"] == 1].set_index(LINK_COLUMNS).index
-        )
+        stands = np.array([member.stands for member in members.values()])
+        far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
+        aimed = measured[measured["component"] == 1]
+        reached = far.set_index(LINK_COLUMNS).index.isin(aimed.set_index(LINK_COLUMNS).index)
         if reached.any():
             summary.assume(RADAR, str(int(reached.sum())))
         back = far[~reached]
         heard = back["neighbour"] * len(members) + back["observer"]
-        summary.reversed_pairs = np.setdiff1d(
-            heard, measured["observer"] * len(members) + measured["neighbour"]
-        ).tolist()
+        own = measured["observer"] * len(members) + measured["neighbour"]
+        summary.reversed_pairs = np.setdiff1d(heard, own).tolist()
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
         both = both.drop_duplicates([*LINK_COLUMNS, "component"])
         if len(both) > len(measured):

@@ -465,12 +465,8 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
-            return max(
-                float(
-                    at.assign(t=((at["t"] - t.min() + SAME_INSTANT) / step).round()).duplicated(["vehicle", "t"]).mean()
-                ),
-                LOST,
-            )
+            steps = at.assign(t=((at["t"] - t.min() + SAME_INSTANT) / step).round())
+            return max(float(steps.duplicated(["vehicle", "t"]).mean()), LOST)
 
         parts = min((1, 2, 3, 4, 5), key=lambda n: lost(step / n))
         if parts > 1:

@@ -145,11 +145,8 @@ def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str
 
 def _of_partner(column: str) -> tuple[str, str] | None:
     """Kind and partner of a column such as range_car2 or azimuth_deg_car2; None for another."""
-    kind = max(
-        [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")],
-        key=len,
-        default="",
-    )
+    kinds = [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")]
+    kind = max(kinds, key=len, default="")
     partner = column[len(kind) + 1 :]
     is_column = not kind or column in KINDS or partner in UNIT_SUFFIXES or column.endswith("_std")
     return None if is_column else (kind, partner)

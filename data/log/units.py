@@ -140,9 +140,8 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     kind, value = own["kind"], own["value"]
     size, limit = value.abs(), kind.map(KIND_LIMITS)
     wrong = (size > limit) | (value < kind.map(LEAST_VALUES)) | ((kind == "range") & (value == 0.0))
-    near = (size > limit) & (
-        size <= LEAP_RATIO * kind.map(size[~wrong].groupby(kind).max())
-    )  # as of an angle in degrees
+    usual = kind.map(size[~wrong].groupby(kind).max())
+    near = (size > limit) & (size <= LEAP_RATIO * usual)  # as of an angle in degrees
     several = value[near].groupby(kind[near]).nunique()
     codes = own[wrong & ~kind.isin(several.index[several > 1])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= MOST_CODES) & (codes["size"] >= 2 * codes["nunique"])]
@@ -212,10 +211,8 @@ def distinct(rows: Rows, summary: "Summary") -> Rows:
     beside = rows["partner"].ne("") & ~of_pair
     rows = rows.assign(partner=rows["partner"].where(of_pair, ""))
     again = rows.duplicated(key) & (rows["kind"] != "message")
-    summary.refuse(
-        "repeated rows (same time, vehicle, kind and partner)",
-        rows[again & ~(beside & rows.duplicated([*key, "value"]))],
-    )
+    lost = again & ~(beside & rows.duplicated([*key, "value"]))
+    summary.refuse("repeated rows (same time, vehicle, kind and partner)", rows[lost])
     return rows[~again]
 
 
