@@ -223,7 +223,7 @@ def test_no_figure_of_the_gallery_hides_a_line(file):
                     at = [x for x in (*a[:, 0], *b[:, 0]) if all(line[0, 0] <= x <= line[-1, 0] for line in (a, b))]
                     gaps = abs(np.interp(at, *a.T) - np.interp(at, *b.T))
                     apart = max(gaps, default=np.inf) * 72 / panel.figure.dpi > first.get_linewidth() / 2
-                    assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
+                    assert apart or any(" ≈ " in text for text in texts), (first.get_color(), second.get_color())
     assert lines_seen or not find("coopoc.studies", file.stem).figures
 
 

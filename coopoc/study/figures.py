@@ -256,7 +256,7 @@ def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
         return ", ".join([first, *(other.removeprefix(start) for other in others)])
     named = [str(of.get("noise_model")) for of in lines[1:]]
     shown = [f"{n}, {m}" if len(models) > 1 and m in models else n for n, m in zip(others, named, strict=True)]
-    return " = ".join([first, *shown])
+    return " ≈ ".join([first, *shown])
 
 
 def _line_names(results: Results, *across: str) -> list[str]:
