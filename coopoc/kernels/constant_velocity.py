@@ -15,6 +15,7 @@ import numpy as np
 
 from ..arrays import Floats
 from .compiling.compile import compiled
+from .compiling.small import add, inner_product, scale, store, subtract, vector_at
 
 BANK = 0.02 * 1.6 ** np.arange(16)
 """w of each filter: from a straight road at a steady speed to fixes that hardly depend on each other."""
@@ -50,43 +51,39 @@ def constant_velocity(
     count, models = len(t), len(bank)
     velocity = np.zeros((count, 3))
     growth, spread, proved = np.zeros((3, count))
-    x, u, p, score = np.zeros((4, models, 3))
-    v, best, prior = np.zeros(3), FIRST_FILTER, PRIOR_COUNT
-    score[:, 0], score[:, 1] = prior, prior * variance
+    x, u, p, score = np.zeros((4, 3 * models))
+    best, prior = FIRST_FILTER, PRIOR_COUNT
+    for m in range(models):
+        store(score, m, (prior, prior * variance, 0.0))
     for j in range(count):
-        dt = t[j] - t[j - 1] if j > 0 else inf
+        fix, dt = vector_at(fixes[j], 0), t[j] - t[j - 1] if j > 0 else inf
         if dt > gap:
             for m in range(models):
-                p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, speed * speed / variance
-                for c in range(3):
-                    x[m, c], u[m, c] = fixes[j, c], 0.0
-            growth[j], spread[j], proved[j] = nan, p[0, 2], variance
+                store(p, m, (1.0, 0.0, speed * speed / variance))
+                store(x, m, fix)
+                store(u, m, (0.0, 0.0, 0.0))
+            growth[j], spread[j], proved[j] = nan, p[2], variance
             continue
         keep, most = exp(-dt / REMEMBERS), -inf
         for m in range(models):
-            q, (before, b, d) = (bank[m] / interval) ** 4, p[m]
+            q, (before, b, d) = (bank[m] / interval) ** 4, vector_at(p, m)
             a = before + 2.0 * dt * b + dt * dt * d + q * dt**3 / 3.0
             b, d = b + dt * d + q * dt * dt / 2.0, d + q * dt
-            s, square = a + 1.0, 0.0
-            for c in range(3):
-                x[m, c] += dt * u[m, c]
-                v[c] = fixes[j, c] - x[m, c]
-                square += v[c] * v[c]
-            numbers, squares, logs = score[m]
+            moved, (numbers, squares, logs) = add(vector_at(x, m), scale(vector_at(u, m), dt)), vector_at(score, m)
+            innovation, s = subtract(fix, moved), a + 1.0
+            square = inner_product(innovation, innovation)
             limit = 3.0 * CLIP_STDS**2 * max(squares / numbers, MIN_VARIANCE) * s
             clip = sqrt(limit / square) if square > limit else 1.0
-            for c in range(3):
-                x[m, c] += clip * a / s * v[c]
-                u[m, c] += clip * b / s * v[c]
-            p[m, 0], p[m, 1], p[m, 2] = a / s, b / s, d - b * b / s
+            store(x, m, add(moved, scale(innovation, clip * a / s)))
+            store(u, m, add(vector_at(u, m), scale(innovation, clip * b / s)))
+            store(p, m, (a / s, b / s, d - b * b / s))
             numbers = prior + keep * (numbers - prior) + 3.0
             squares = prior * variance + keep * (squares - prior * variance) + min(square, limit) / s
             logs = keep * logs + 3.0 * log(s)
-            score[m, 0], score[m, 1], score[m, 2] = numbers, squares, logs
+            store(score, m, (numbers, squares, logs))
             likely = -0.5 * (numbers * log(max(squares / numbers, MIN_VARIANCE)) + logs)
             if likely > most:
                 best, most, growth[j] = m, likely, a - before
-        for c in range(3):
-            velocity[j, c] = u[best, c]
-        spread[j], proved[j] = p[best, 2], score[best, 1] / score[best, 0]
+        store(velocity[j], 0, vector_at(u, best))
+        spread[j], proved[j] = p[3 * best + 2], score[3 * best + 1] / score[3 * best]
     return velocity, growth, spread, proved

@@ -6,12 +6,12 @@ from math import isfinite, isnan
 import numpy as np
 
 from ..arrays import Floats, Ints
-from .compiling.compile import compiled, inside
-from .compiling.small import add, inner_product, over, scale, subtract, times
+from .compiling.compile import compiled
+from .compiling.small import add, block_at, normalised_square, scale, subtract, times, vector_at
 from .gate import FIX_GATE, HARD_REJECT_FACTOR
-from .geometry import Numbers, direction, five, residuals, with_std
+from .geometry import direction, five, residuals, with_std
 from .stars.gaussian import distance
-from .stars.messages import BLOCK, ROW, block_at, three_of, vector_at
+from .stars.messages import BLOCK, ROW, three_of
 
 MAX_CORRELATION2 = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
@@ -81,24 +81,18 @@ def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Flo
                 own = ROW
                 if len(cov) > 0:
                     own = cov[run, now, k, 0, 0], cov[run, now, k, 1, 1], cov[run, now, k, 2, 2]
-                first, t, q = now if count == 0 else first, now + every, squared(gap, add(add(white, lasts), own))
+                q = normalised_square(gap, add(add(white, lasts), own))
+                first, t = now if count == 0 else first, now + every
                 r, p = add(r, gap), add(add(p, own), add(scale(white, 1.0 / JUDGED_IN_A_ROW), lasts))
                 count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / JUDGED_IN_A_ROW
                 if count == JUDGED_IN_A_ROW:
-                    mean = max(mean, squared(r, p) / JUDGED_IN_A_ROW)
+                    mean = max(mean, normalised_square(r, p) / JUDGED_IN_A_ROW)
                     worst[run, k] = max(worst[run, k], mean)
                     kind = int(far < JUDGED_IN_A_ROW)
                     if kind == 0 or (len(cov) > 0 and mean > DOUBT):
                         marks[kind, k, first:t] = 1
                     count, far, mean, r, p = 0, 0, 0.0, ROW, ROW
     return worst
-
-
-@inside
-def squared(gap: Numbers, variance: Numbers) -> float:
-    """Squared normalised difference."""
-    total: float = inner_product(times(gap, gap), over(variance))
-    return total
 
 
 @compiled
@@ -138,12 +132,12 @@ def mark_neighbours(
                 continue
             polar = direction(gap)
             measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)
-            far, reach = residuals(measured, polar), polar[0] * polar[3]
-            q = far[0] ** 2 / (measured[5] ** 2 + own) + (far[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
-            q += (far[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
+            lengths = 1.0, polar[0] * polar[3], polar[0]
+            noise, wide = times(measured[5:], lengths), (own, own, own)
+            q = normalised_square(times(residuals(measured, polar), lengths), add(times(noise, noise), wide))
             own += std[0] ** 2 + (polar[0] * std[1]) ** 2
             wide = add(add(three_of(fix, t, j, 0), lasts), (own, own, own))
-            message = squared(subtract(three_of(gnss, run, t, j), there), wide)
+            message = normalised_square(subtract(three_of(gnss, run, t, j), there), wide)
             counts[j, 2] = t if counts[j, 1] == 0 else counts[j, 2]
             counts[j, 0], counts[j, 1] = t + every, counts[j, 1] + 1
             counts[j, 3] += message > HARD_REJECT_FACTOR * FIX_GATE

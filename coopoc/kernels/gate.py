@@ -19,7 +19,19 @@ cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 import math
 
 from .compiling.compile import inside
-from .compiling.small import add, add_diagonal, apply, choose_each, from_upper, inner_product, inverse, scale, subtract
+from .compiling.small import (
+    add,
+    add_diagonal,
+    apply,
+    choose_each,
+    from_upper,
+    inner_product,
+    inverse,
+    normalised_square,
+    scale,
+    subtract,
+    trace,
+)
 from .compiling.vectors import Lanes, choose
 
 GATE, FIX_GATE = 9.0, 12.0
@@ -76,7 +88,7 @@ def count(q: float, gate: float, hits: float, gain: float) -> Lanes:
 @inside
 def remember(
     q: float, other: float, gate: float, gain: float, apart: float, spread: float, evidence: float, since: float
-) -> tuple[float, float, float]:
+) -> Vector:
     """What becomes of the position that is remembered, and the next `evidence` and `since`.
 
     Args:
@@ -132,16 +144,15 @@ def vote(votes: Vector, moved: Vector, process: Vector, fix: Vector, variance: V
 @inside
 def apart_by(gap: Vector, variance: Vector, spread: float) -> float:
     """Squared normalised distance of two fixes, one of them moved."""
-    a, b, c = gap
     s = spread + SLIP_M2
-    return a * a / (2.0 * variance[0] + s) + b * b / (2.0 * variance[1] + s) + c * c / (2.0 * variance[2] + s)
+    return normalised_square(gap, add(scale(variance, 2.0), (s, s, s)))  # type: ignore[no-any-return]
 
 
 @inside
 def gain_of(cov: Vector, variance: Vector) -> float:
     """Gain of a position, the mean over the axes: tr P / (tr P + tr R)."""
-    own = cov[0] + cov[4] + cov[8]
-    return own / (own + (variance[0] + variance[1] + variance[2]))
+    own = trace(cov)
+    return own / (own + (variance[0] + variance[1] + variance[2]))  # type: ignore[no-any-return]
 
 
 @inside

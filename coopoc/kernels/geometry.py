@@ -14,7 +14,7 @@ from numba.extending import overload
 
 from ..arrays import Floats, Ints
 from .compiling.compile import as_written, inner, inside
-from .compiling.small import apply, from_upper, subtract
+from .compiling.small import add, apply, choose_each, from_upper, scale, subtract, vector_at
 from .compiling.vectors import Batched, Lanes, choose, lane, less, pack, plus
 
 Five: TypeAlias = tuple[float, float, float, float, float]
@@ -65,6 +65,12 @@ def with_std(measured: Sequence[float] | Floats, std: Sequence[float] | Floats) 
     if si == 0.0 and ci == 0.0:
         si, c = 1.0, inf
     return d, sa, ca, si, ci, a, b, c
+
+
+@inside
+def submatrix(p: Floats, i: int, j: int) -> Numbers:
+    """The 3 x 3 block of a matrix whose first number is (i, j)."""
+    return *vector_at(p[i, j:], 0), *vector_at(p[i + 1, j:], 0), *vector_at(p[i + 2, j:], 0)
 
 
 @inner
@@ -133,14 +139,6 @@ def axes(polar: Numbers) -> tuple[Numbers, Numbers, Numbers]:
 
 
 @inside
-def along(polar: Numbers, a: float, b: float, c: float) -> Numbers:
-    """a e_r + b e_a + c e_i."""
-    _, sa, ca, si, ci = polar
-    ground = plus(a * si, c, ci)
-    return less(ground * ca, b, sa), plus(ground * sa, b, ca), less(a * ci, c, si)
-
-
-@inside
 def spread(polar: Numbers, a: float, b: float, c: float) -> Lanes:
     """a e_r e_r^T + b e_a e_a^T + c e_i e_i^T: a covariance from variances along them, or information from theirs."""
     _, sa, ca, si, ci = polar
@@ -170,7 +168,7 @@ def converted(gap: Numbers, measured: Numbers, unit: bool, least: float) -> tupl
 
 
 @inside
-def residuals(measured: Numbers, polar: Numbers) -> tuple[float, float, float]:
+def residuals(measured: Numbers, polar: Numbers) -> Numbers:
     """Measured less predicted range m, azimuth and inclination rad: the angles between two directions, which need no
     wrapping."""
     d, sa, ca, si, ci = polar
@@ -184,12 +182,13 @@ def exact(gap: Numbers, measured: Numbers, least: float) -> tuple[Numbers, Numbe
     """J^T J and J^T r of the whitened range, azimuth and inclination at the vector `gap`; an angle weighs no more than
     at `least` m."""
     polar = direction(gap)
-    longer, turned, raised = residuals(measured, polar)
+    (ray, right, down), (longer, turned, raised) = axes(polar), residuals(measured, polar)
     d, reach = polar[0], max(polar[0], least)
     a, b, c = 1.0 / measured[5], 1.0 / measured[6], 1.0 / measured[7]
     flat = max(abs(polar[3]), 1e-3) * reach
     side, up = b * d * polar[3] / (flat * flat), c * d / (reach * reach)
-    return spread(polar, a * a, side * side, up * up), along(polar, a * a * longer, side * b * turned, up * c * raised)
+    across = add(scale(right, side * b * turned), scale(down, up * c * raised))
+    return spread(polar, a * a, side * side, up * up), add(scale(ray, a * a * longer), across)
 
 
 @inside
@@ -218,8 +217,6 @@ def completed(measured: Numbers, polar: Numbers) -> Five:
     reach, azimuth, inclination = limit - measured[5], limit - measured[6], limit - measured[7]
     return (
         choose(reach, measured[0], polar[0]),
-        choose(azimuth, measured[1], polar[1]),
-        choose(azimuth, measured[2], polar[2]),
-        choose(inclination, measured[3], polar[3]),
-        choose(inclination, measured[4], polar[4]),
+        *choose_each(azimuth, measured[1:3], polar[1:3]),
+        *choose_each(inclination, measured[3:5], polar[3:5]),
     )

@@ -5,18 +5,17 @@ that `gate.remember` is about, the hits of fixes beyond the gate, and the eviden
 """
 
 from math import inf, isinf, isnan
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import Floats, Ints
-from .compiling.compile import compiled, inside, part
-from .compiling.small import add, inner_product, load, scale, store, subtract
+from .compiling.compile import compiled, inside
+from .compiling.small import add, inner_product, load, normalised_square, over, scale, store, subtract, times
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import BACK, BEGIN, CONFIRMED, KEEP, NOT_REMEMBERED_M2, SLIP_M2, count, inflation, remember, vote
+from .gate import BACK, BEGIN, CONFIRMED, KEEP, NOT_REMEMBERED_M2, SLIP_M2, Vector, count, inflation, remember, vote
 from .motion import MotionNoise
 
-Vector: TypeAlias = tuple[float, float, float]
 X, P, BEFORE, SPREAD, MEMORY = range(3, 8)
 """Numbers of the vectors in a state, behind the votes."""
 OURS, POSITION, HITS, EVIDENCE, SINCE = 7, slice(9, 12), 21, 22, 23
@@ -71,12 +70,8 @@ def begin(state: Floats, x: Vector, variance: Vector, votes: float) -> None:
 @inside
 def off(state: Floats, k: int, moved: Vector, fix: Vector, noise: Vector) -> float:
     """Squared normalised distance of a fix from the position that is vector k, before it is moved."""
-    q = 0.0
-    for c in range(3):
-        gap = fix[c] - state[3 * k + c] - moved[c]
-        if not isnan(gap):
-            q += gap * gap / (state[3 * k + 3 + c] + noise[c] + SLIP_M2)
-    return q
+    gap, slip = subtract(subtract(fix, load(state, k, ROW)), moved), (SLIP_M2, SLIP_M2, SLIP_M2)
+    return 0.0 if isnan(fix[0]) else normalised_square(gap, add(add(load(state, k + 1, ROW), noise), slip))
 
 
 @inside
@@ -91,12 +86,11 @@ def gate_fix(state: Floats, moved: Vector, process: Vector, fix: Vector, noise: 
             store(state, P, noise)
             store(state, MEMORY, ROW)
             return inf
-    q, hits, gain = off(state, X, moved, fix, noise), state[HITS], 0.0
+    q, hits = off(state, X, moved, fix, noise), state[HITS]
     if q <= gate and hits == 0.0 and state[3 * SPREAD] >= NOT_REMEMBERED_M2:
         return 1.0
     x, p, before, spread = load(state, X, ROW), load(state, P, ROW), load(state, BEFORE, ROW), load(state, SPREAD, ROW)
-    for c in range(3):
-        gain += 0.0 if isnan(fix[c]) else p[c] / (3.0 * (p[c] + noise[c]))
+    gain = 0.0 if isnan(fix[0]) else sum(times(p, over(add(p, noise)))) / 3.0
     gap, other = subtract(before, x), off(state, BEFORE, moved, fix, noise)
     apart, evidence, since = inner_product(gap, gap), state[EVIDENCE], state[SINCE]
     what, state[EVIDENCE], state[SINCE] = remember(q, other, gate, gain, apart, sum(spread), evidence, since)
@@ -151,41 +145,24 @@ def run_filter(measurements: SoloMeasurements, gate: float, exact: bool, index: 
     """
     noise = np.empty(x.shape if gate > 0.0 else (0, 0, 0, 3))
     states = np.empty((len(measurements.columns), len(STATE)))
-    filter_runs(measurements, gate, exact, index, states, x, p, noise)
-    return noise
-
-
-@part
-def filter_runs(
-    measurements: SoloMeasurements,
-    gate: float,
-    exact: bool,
-    index: Ints,
-    states: Floats,
-    x: Floats,
-    p: Floats,
-    noise: Floats,
-) -> None:
-    """`run_filter` in given memory."""
     for run in range(measurements.gnss.shape[0]):
         for t in range(measurements.gnss.shape[1]):
             for e in range(len(measurements.columns)):
                 n, at, state, f = measurements.columns[e], index[e], states[e], 1.0
-                moved, q = (
-                    scale(three(measurements.velocity[run, t, n]), measurements.dt),
-                    measurements.process[run, t, e],
-                )
+                moved = scale(three(measurements.velocity[run, t, n]), measurements.dt)
+                q = three(measurements.process[run, t, e])
                 fix, r = three(measurements.gnss[run, t, n]), three(measurements.fixes[t, e])
                 if t == 0 and exact:
                     begin(state, three(x[run, 0, at]), ROW, CONFIRMED)
                 elif t == 0 or isnan(state[3 * X] + moved[0]):
                     begin(state, fix, r, 1.0)
                 else:
-                    f = step(state, moved, three(q), fix, r, gate)
+                    f = step(state, moved, q, fix, r, gate)
                 store(x[run, t, at], 0, load(state, X, ROW))
                 store(p[run, t, at], 0, load(state, P, ROW))
                 if len(noise):
                     store(noise[run, t, at], 0, scale(r, f))
+    return noise
 
 
 @compiled

@@ -1,7 +1,6 @@
 """Machine code on disk: compiled once per machine, found again by the content of its sources."""
 
 import hashlib
-import json
 import re
 import sys
 from collections.abc import Callable
@@ -86,19 +85,10 @@ def _locator(function: Any) -> Any:
     return next((locator for locator in locators if locator is not None), None)
 
 
-def versions() -> dict[str, str]:
-    """What machine code depends on beside its sources and the processor."""
-    return {
-        "python": "{}.{}".format(*sys.version_info),
-        "numba": numba.__version__,
-        "llvmlite": llvmlite.__version__,
-        "platform": llvm.get_process_triple(),
-    }
-
-
 def stamp(function: Callable[..., Any]) -> str:
     """Digest of every source whose change makes a function's machine code stale, and of what compiles it."""
-    digest = hashlib.sha256(json.dumps(versions()).encode())
+    compiler = sys.version_info[:2], numba.__version__, llvmlite.__version__, llvm.get_process_triple()
+    digest = hashlib.sha256(repr(compiler).encode())
     for name in sorted(sources(function.__module__)):
         digest.update(f"{name} {_digest(_file(name))}\n".encode())
     return digest.hexdigest()

@@ -25,21 +25,27 @@ def _dot(first: Number, a: Numbers, b: Numbers) -> Number:
     return first
 
 
-def _rounded(first: Number, a: Numbers, b: Numbers) -> Number:
-    """first + a b, every product and sum rounded by itself."""
-    for x, y in zip(a, b, strict=True):
-        first = first + x * y
-    return first
-
-
 def _inner(a: Numbers, b: Numbers) -> Number:
-    return _rounded(a[0] * b[0], a[1:], b[1:])
+    first, *others = (x * y for x, y in zip(a, b, strict=True))
+    return sum(others, first)
 
 
 @unrolled
 def load(memory: Any, at: Any, like: Any) -> Any:
     """Tuple number `at` of those, as long as `like`, that stand in memory one after the other."""
     return memory.read(at, len(like))
+
+
+@unrolled
+def vector_at(memory: Any, at: Any) -> Any:
+    """Vector number `at` of those of three numbers."""
+    return memory.read(at, 3)
+
+
+@unrolled
+def block_at(memory: Any, at: Any) -> Any:
+    """Matrix number `at` of those of 3 x 3 numbers."""
+    return memory.read(at, 9)
 
 
 @unrolled
@@ -74,6 +80,22 @@ def times(a: Any, b: Any) -> Any:
 
 inner_product: Any = unrolled(_inner)
 """The sum of a_i b_i, every product and sum rounded by itself."""
+less_inner_product: Any = unrolled(_dot)
+"""first - the sum of a_i b_i."""
+
+
+@unrolled
+def normalised_square(a: Any, variance: Any) -> Any:
+    """The sum of a_i^2 / variance_i."""
+    first, *others = (x * x / v for x, v in zip(a, variance, strict=True))
+    return sum(others, first)
+
+
+@unrolled
+def trace(a: Any) -> Any:
+    """Of a matrix."""
+    first, *others = a[:: math.isqrt(len(a)) + 1]
+    return sum(others, first)
 
 
 @unrolled
@@ -143,24 +165,10 @@ def less_transposed_product(t: Any, a: Any, b: Any) -> Any:
 
 
 @unrolled
-def less_applied(t: Any, a: Any, v: Any) -> Any:
-    """t - A v."""
-    d = len(v)
-    return [_dot(t[i], a[i * d : i * d + d], v) for i in range(d)]
-
-
-@unrolled
 def apply(a: Any, v: Any) -> Any:
     """A v, every product and sum rounded by itself."""
     d = len(v)
     return [_inner(a[i * d : i * d + d], v) for i in range(d)]
-
-
-@unrolled
-def plus_applied(t: Any, a: Any, v: Any) -> Any:
-    """t + A v, every product and sum rounded by itself."""
-    d = len(v)
-    return [_rounded(t[i], a[i * d : i * d + d], v) for i in range(d)]
 
 
 @unrolled

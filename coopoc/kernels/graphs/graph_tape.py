@@ -81,12 +81,9 @@ def accumulate(tape: Tape, x: Floats, nodes: Ints, numbers: Floats, goal: Ints, 
                 for i in range(VECTORS):
                     p, q = take(w, a * VECTORS + i), take(w, b * VECTORS + i)
                     put(w, o * VECTORS + i, arithmetic(code, p, q))
-            elif code < Operation.FABS:
-                for i in range(TAPE_LANES):
-                    w[o, i] = transcendental(code, w[a, i], w[b, i])
             else:
                 for i in range(TAPE_LANES):
-                    w[o, i] = piecewise(code, w[a, i], w[b, i])
+                    w[o, i] = scalar(code, w[a, i], w[b, i])
 
 
 @inside
@@ -111,9 +108,9 @@ def arithmetic(code: int, a: float, b: float) -> float:
 
 
 @part
-def transcendental(code: int, a: float, b: float) -> float:
-    """SIN to CONSTPOW."""
-    y = a
+def scalar(code: int, a: float, b: float) -> float:
+    """SIN to IF_ELSE_ZERO; comparisons and logic give 1 for true."""
+    y = 0.0
     if code == Operation.SIN:
         y = np.sin(a)
     elif code == Operation.COS:
@@ -136,14 +133,7 @@ def transcendental(code: int, a: float, b: float) -> float:
         y = np.log1p(a)
     elif code == Operation.POW or code == Operation.CONSTPOW:
         y = a**b
-    return y
-
-
-@part
-def piecewise(code: int, a: float, b: float) -> float:
-    """FABS to IF_ELSE_ZERO: remainders, comparisons and logic, true as 1."""
-    y = 0.0
-    if code == Operation.FABS:
+    elif code == Operation.FABS:
         y = abs(a)
     elif code == Operation.SIGN:
         y = np.sign(a)

@@ -15,10 +15,10 @@ from numpy import uint64
 
 from ...arrays import Floats
 from ..compiling.compile import inside, part
-from ..compiling.small import from_upper
+from ..compiling.small import add, apply, inner_product, less_inner_product, subtract
 from ..compiling.vectors import LANES, less, plus, put, take
 from ..gate import FIX_GATE, GATE, count, gate_fix, inflation
-from ..geometry import Numbers, axes, direction
+from ..geometry import Numbers, axes, direction, submatrix
 from ..motion import MotionNoise
 
 HEADING = 3
@@ -38,6 +38,7 @@ ZERO: Any = np.int64(0)
 """Numbers of the type of a variable: a literal would compile a function of ends once more."""
 Row = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
+POSITION_ROWS: tuple[Row, ...] = ((1.0,) + (0.0,) * 5, (0.0, 1.0) + (0.0,) * 4, (0.0, 0.0, 1.0) + (0.0,) * 3)
 
 
 class PoseNoise(NamedTuple):
@@ -198,20 +199,21 @@ def apply_pending_rows(poses: Poses) -> None:
     """Apply the pending rows to the covariance, two of its rows at a time: each column is read half as often."""
     cov, columns, gains = poses.cov, poses.columns, poses.gains
     size, tiles, pending = len(poses.x), len(poses.x) // LANES, int(poses.totals[PENDING])
-    for q in range(pending, ROWS if pending > 0 else 0):
+    if pending == 0:
+        return
+    for q in range(pending, ROWS):
         for i in range(size):
             gains[q, i] = 0.0
-    for i in range(0, size if pending > 0 else 0, 2):
-        p, q, r, s = gains[0, i], gains[1, i], gains[2, i], gains[3, i]
-        a, b, c, d = gains[0, i + 1], gains[1, i + 1], gains[2, i + 1], gains[3, i + 1]
-        if abs(p) + abs(q) + abs(r) + abs(s) + abs(a) + abs(b) + abs(c) + abs(d) != 0.0:
+    for i in range(0, size, 2):
+        upper = gains[0, i], gains[1, i], gains[2, i], gains[3, i]
+        lower = gains[0, i + 1], gains[1, i + 1], gains[2, i + 1], gains[3, i + 1]
+        if inner_product(upper, upper) + inner_product(lower, lower) != 0.0:
             for tile in range(tiles):
-                w, x = entries(columns, 0, tile, tiles), entries(columns, 1, tile, tiles)
-                y, z = entries(columns, 2, tile, tiles), entries(columns, 3, tile, tiles)
-                upper = less(less(less(less(entries(cov, i, tile, tiles), p, w), q, x), r, y), s, z)
-                lower = less(less(less(less(entries(cov, i + 1, tile, tiles), a, w), b, x), c, y), d, z)
-                put(cov, uint64(i * tiles + tile), upper)
-                put(cov, uint64((i + 1) * tiles + tile), lower)
+                first, second = entries(columns, 0, tile, tiles), entries(columns, 1, tile, tiles)
+                rows = first, second, entries(columns, 2, tile, tiles), entries(columns, 3, tile, tiles)
+                above, below = uint64(i * tiles + tile), uint64((i + 1) * tiles + tile)
+                put(cov, above, less_inner_product(take(cov, above), upper, rows))
+                put(cov, below, less_inner_product(take(cov, below), lower, rows))
     poses.totals[PENDING] = 0.0
 
 
@@ -235,12 +237,10 @@ def update_fix(poses: Poses, member: int, fix: Floats, variance: Three, gate: fl
     if isfinite(gate):
         apply_pending_rows(poses)
         gap = fix[0] - poses.x[m], fix[1] - poses.x[m + 1], fix[2] - poses.x[m + 2]
-        xx, xy, xz = cov[m, m], cov[m, m + 1], cov[m, m + 2]
-        own = from_upper((xx, xy, xz, cov[m + 1, m + 1], cov[m + 1, m + 2], cov[m + 2, m + 2]))
-        share, hits[m] = gate_fix(gap, own, variance, FIX_GATE / GATE * gate, hits[m])
+        share, hits[m] = gate_fix(gap, submatrix(cov, m, m), variance, FIX_GATE / GATE * gate, hits[m])
     for axis in range(3 if isfinite(share) else 0):
-        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0, 0.0)
-        update_row(poses, (member, ALONE, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], inf)
+        residual, noise = fix[axis] - poses.x[m + axis], share * variance[axis]
+        update_row(poses, (member, ALONE, ALONE), POSITION_ROWS[axis], residual, noise, inf)
 
 
 @part
@@ -325,22 +325,16 @@ def curvature(cov: Floats, ends: Ends, polar: Numbers) -> Three:
     H, where the vector between both ends errs by P (the second-order filter)."""
     (ray, side, up), d = axes(polar), max(polar[0], MIN_ANGLE_DISTANCE)
     flat, out = max(d * polar[3], MIN_ANGLE_DISTANCE), (polar[2], polar[1], 0.0)
-    ss, su, uu = gap_cov(cov, ends, side, side), gap_cov(cov, ends, side, up), gap_cov(cov, ends, up, up)
-    rs, ru, rr = gap_cov(cov, ends, ray, side), gap_cov(cov, ends, ray, up), gap_cov(cov, ends, ray, ray)
-    oo, os, steep = gap_cov(cov, ends, out, out), gap_cov(cov, ends, out, side), d * polar[4] / flat
+    (k, o, _), steep = ends, d * polar[4] / flat
+    p = submatrix(cov, k, k)
+    if o >= 0:
+        p = subtract(add(p, submatrix(cov, o, o)), add(submatrix(cov, k, o), submatrix(cov, o, k)))
+    aside, above = apply(p, side), apply(p, up)
+    ss, su, uu = inner_product(side, aside), inner_product(side, above), inner_product(up, above)
+    rs, ru, rr = inner_product(ray, aside), inner_product(ray, above), inner_product(ray, apply(p, ray))
+    oo, os = inner_product(out, apply(p, out)), inner_product(out, aside)
     return (
         (0.5 * (ss * ss + uu * uu) + su * su) / d**2,
         (oo * ss + os * os) / flat**4,
         (rr * uu + ru * ru - 2.0 * steep * rs * su + 0.5 * steep**2 * ss * ss) / d**4,
     )
-
-
-@part
-def gap_cov(cov: Floats, ends: Ends, a: Numbers, b: Numbers) -> float:
-    """Covariance m^2, along two directions, of the vector from a member to another or to a landmark."""
-    (k, o, _), row, total = ends, (b[0], b[1], b[2], 0.0, 0.0, 0.0), 0.0
-    for i in range(3):
-        total += a[i] * along(cov[k + i], ends, row)
-        if o >= 0:
-            total -= a[i] * along(cov[o + i], ends, row)
-    return total

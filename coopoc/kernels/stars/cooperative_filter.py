@@ -11,9 +11,19 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import apply, inner_product, load, negate, store, subtract
+from ..compiling.small import (
+    apply,
+    inner_product,
+    load,
+    negate,
+    scale,
+    store,
+    subtract,
+    times,
+    vector_at,
+)
 from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOT_REMEMBERED_M2, SLIP_M2, remember
-from ..geometry import angle
+from ..geometry import direction, metres, residuals
 from .cooperative_members import dismiss, join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import fix_terms, follow_majority, goes_on, may_slip, receive, take_fix, trust, use_fix
 from .cooperative_state import (
@@ -103,7 +113,7 @@ from .gaussian import (
     widen,
 )
 from .lasting import add_lasting, remember_error
-from .messages import Assumptions, Measurements, three_of, vector_at
+from .messages import Assumptions, Measurements, three_of
 from .otherwise import (
     AGAINST,
     ALIKE,
@@ -171,21 +181,22 @@ def run_filter(
     runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
     most, of_ego = measurements.most, np.full((runs, steps, FOUND + 13), math.nan)
     by_link = np.full((runs, measurements.relative.shape[1], 9), math.nan)
-    own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
+    own, memory = np.zeros(OWN), np.zeros((most, WIDTH))
     for run in range(runs):
         f, tries = new_filter(most, vehicles), new_tries(most, vehicles)
         own[LAST_FIX:] = math.nan
         for t in range(steps):
-            count = gather(own, rows, who, measurements, assumed, sent, odometry, model.white, run, t)
+            who = measurements.neighbour[measurements.start[t] : measurements.start[t + 1]]
+            rows = memory[: len(who)]
+            gather(own, rows, who, measurements, assumed, sent, odometry, model.white, run, t)
             if f.g.vectors[0] == 0:
-                if not is_placed(own, rows, count):
+                if not is_placed(own, rows):
                     continue
-                begin(f, model, own, rows, count, measurements.ego)
-            step(f, tries, model, own, rows, who, count)
+                begin(f, model, own, rows, measurements.ego)
+            step(f, tries, model, own, rows, who)
             of_ego[run, t, 0] = f.member[0, OUT + 3]
-            for i in range(FOUND + 12):
-                of_ego[run, t, 1 + i] = f.ego[TOLD + i]
-            for i in range(count):
+            of_ego[run, t, 1:] = f.ego[TOLD:BARE]
+            for i in range(len(who)):
                 k, answer = f.slot[who[i]], by_link[run, measurements.start[t] + i]
                 if k < 0:  # the star was left
                     continue
@@ -208,24 +219,23 @@ def gather(
     white: Floats,
     run: int,
     t: int,
-) -> int:
-    """Fill the ego's row of a step, and its neighbours', with the newest message of each; how many these are."""
+) -> None:
+    """Fill the ego's row of a step, and those of neighbours, with the newest message of each."""
     ego, dt, first = measurements.ego, measurements.dt, measurements.start[t]
     u, r = measurements.velocity[run, t, ego], three_of(assumed.fixes, run, t, ego)
     q, own[DT] = three_of(assumed.process, run, t, ego), dt
-    for c in range(3):
-        own[FIX_VARIANCE + c] = r[c] * white[c]
-        own[MOTION + c], own[MOTION_VARIANCE + c] = dt * u[c], q[c]
+    store(own, FIX_VARIANCE // 3, times(r, vector_at(white, 0)))
+    store(own, MOTION // 3, scale(vector_at(u, 0), dt))
+    store(own, MOTION_VARIANCE // 3, q)
     take_fix(measurements.gnss[run, t, ego], own[MOTION:], r[0], own[LAST_FIX:], own)
     for i in range(4):
         own[BY_FIXES + i] = odometry[run, t, i]
     measured_motion(own)
-    count = measurements.start[t + 1] - first
-    for i in range(count):
+    for i in range(len(who)):
         link = first + i
         for c in range(5):
             rows[i, c] = measurements.relative[run, link, c]
-        who[i], when = measurements.neighbour[link], measurements.newest[run, link]
+        when = measurements.newest[run, link]
         rows[i, AGE] = (t - when) * dt if when >= 0 else -1.0
         if when < 0:
             continue
@@ -233,13 +243,13 @@ def gather(
         fix = three_of(assumed.fixes, run, when, who[i])
         for c in range(9):
             rows[i, SOLO + c] = sent[who[i], run, when, c]
-        for c in range(3):
-            rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
-    return int(count)
+        store(rows[i], SPEED // 3, vector_at(u, 0))
+        store(rows[i], STEP // 3, q)
+        store(rows[i], TYPICAL // 3, fix)
 
 
 @inner
-def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehicles: Ints) -> None:
     """One step. Where its innovations are unlikely, it is also tried for an ego that slips, or whose odometry fails as
     its fixes show, and the likelier result is kept. Once the ego has met a neighbour, a filter of the ego alone runs
     beside this one.
@@ -249,9 +259,8 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
         tries: memory.
         model: noise model.
         own: (OWN,) the ego's row; the motion of the first step is not used.
-        rows: (count, WIDTH) of the neighbours that are measured now.
-        vehicles: (count,) which they are.
-        count: of them.
+        rows: (k, WIDTH) of the neighbours that are measured now.
+        vehicles: (k,) which they are.
     """
     ego = f.ego
     doubts = tries.doubts
@@ -259,7 +268,7 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
     if not failure_known:
         doubts[PENDING] = doubts[PENDING] + own[MORE] if own[MORE] > 0.0 else 0.0
     ego[NOW] = ego[CORRECTED] = 0.0
-    if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
+    if model.forget > 0.0 and len(rows) > 0 and tries.alone.g.vectors[0] == 0:
         copy_filter(f, tries.alone)
     copy(own, tries.first)
     remember_speed(f, own)
@@ -267,7 +276,7 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
         copy_filter(f, other)
         copy(own, tries.own)
         copy_rows(rows, tries.rows)
-    attempt(f, model, own, rows, vehicles, count)
+    attempt(f, model, own, rows, vehicles)
     fails = doubts[PENDING] > 0.0
     if slips and surprised(f, fails or failure_known):
         other.ego[NOW] = 1.0
@@ -275,7 +284,7 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
             remember_place(other, hidden(other, tries.own))
         if fails or failure_known:
             corrected_motion(other, tries.own, tries.own[MORE] if failure_known else doubts[PENDING])
-        attempt(other, model, tries.own, tries.rows, vehicles, count)
+        attempt(other, model, tries.own, tries.rows[: len(rows)], vehicles)
         probably = chance(other, f, own[DT], fails, failure_known)
         if probably >= 0.5:
             copy_filter(other, f)
@@ -290,12 +299,12 @@ def step(f: Filter, tries: Tries, model: Model, own: Floats, rows: Floats, vehic
     remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
-        compare(f, tries, model, rows, vehicles, count)
+        compare(f, tries, model, rows, vehicles)
     add_lasting(f, model, tries.first)
 
 
 @inner
-def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints, count: int) -> None:
+def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints) -> None:
     """A step of the ego alone, whose answer counts where something is wrong with its star."""
     ego = f.ego
     alone, doubts, own = tries.alone, tries.doubts, tries.first
@@ -303,7 +312,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
     remember_speed(alone, own)
     if doubts[PENDING] == KNOWN:
         corrected_motion(alone, own, own[MORE])
-    attempt(alone, model, own, rows, vehicles, 0)
+    attempt(alone, model, own, rows[:0], vehicles)
     average(alone, model)
     doubts[ALONE_FOR] -= own[DT]
     if not math.isnan(own[FIX]):
@@ -311,7 +320,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
         doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, model, own) - gap_to_fix(alone, model, own)
         doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
         answers = vector_at(alone.ego, ANSWER // 3), vector_at(ego, ANSWER // 3)
-        doubts[ALIKE] = keep * doubts[ALIKE] + speak_for(f, model, own, rows, count, *answers)
+        doubts[ALIKE] = keep * doubts[ALIKE] + speak_for(f, model, own, rows, *answers)
         loudest = max(ego[LEVEL], ego[LEVEL + 1], ego[LEVEL + 2])
         if (
             (loudest > LOUDEST_NOISE or doubts[ALIKE] > AGAINST)
@@ -328,13 +337,13 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints,
 
 
 @inner
-def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints) -> None:
     """Predict and update, and count what that says of a slip."""
     who = f.who
     ego = f.ego
     ego[LIKELY] = ego[NUMBERS] = ego[SQUARES] = 0.0
-    leave(f, model, own, rows, vehicles, count)
-    scale_motion_noise(f, own, rows, vehicles, count)
+    leave(f, model, own, rows, vehicles)
+    scale_motion_noise(f, own, rows, vehicles)
     ego[SPAN] = own[DT]
     ego[SINCE_FIX] += own[DT]
     trusted = f.status[who[0, VEHICLE], TRUSTED] > 0.0
@@ -349,13 +358,13 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     if ego[STEPS] > f.member[0, JOINED]:
         predict(f, model, own)
     moved(f, own)
-    for i in range(count):
+    for i in range(len(rows)):
         if f.slot[vehicles[i]] < 0:
             join(f, model, rows, vehicles[i], i)
     for k in range(len(who)):
         for c in range(4):
             f.member[k, OUT + c] = math.nan
-    add_fix(f, model, own, rows, count)
+    add_fix(f, model, own, rows)
     members = locate(f)
     for i in range(members):
         k = who[i, ORDER]
@@ -408,7 +417,7 @@ def gap2(f: Filter, k: int) -> float:
 
 
 @inside
-def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> None:
+def add_fix(f: Filter, model: Model, own: Floats, rows: Floats) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share."""
     level = math.exp(f.ego[LEVEL + FIXES])
     if math.isnan(own[FIX]):
@@ -421,10 +430,10 @@ def add_fix(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> N
     if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, model, FIXES)
         show(f, own)
-        if model.fix_gate > 0.0 and goes_back(f, model, own, rows, count, q):
+        if model.fix_gate > 0.0 and goes_back(f, model, own, rows, q):
             fix_terms(f, 0)
             q = innovate(f.g, f.h)
-    spoken = speak_for(f, model, own, rows, count, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
+    spoken = speak_for(f, model, own, rows, vector_at(f.g.x, 0), vector_at(own, FIX // 3))
     use_fix(f, model, 0, True, q, spoken >= 0.0, may_slip(own, FIX_VARIANCE, way * way))
     corrected(f)
 
@@ -440,7 +449,7 @@ def remember_place(f: Filter, more: float) -> None:
 
 
 @inside
-def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q: float) -> bool:
+def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, q: float) -> bool:
     """Whether an ego is where it was before fixes contradicted it (`gate.remember`), and no neighbours say otherwise:
     then it goes back, and they join anew."""
     g, h, left = f.g, f.h, f.ego[LEFT:]
@@ -458,13 +467,13 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
     if what == BEGIN:
         remember_place(f, 0.0)
         return False
-    if what == BACK and speak_for(f, model, own, rows, count, vector_at(g.x, 0), vector_at(left, 0)) > 0.0:
+    if what == BACK and speak_for(f, model, own, rows, vector_at(g.x, 0), vector_at(left, 0)) > 0.0:
         return False
     if what == BACK:
         for k in range(1, len(f.who)):
             if f.who[k, VEHICLE] >= 0:
                 dismiss(f, model, k, False)
-        set_trust(f, f.who[0, VEHICLE], 1.0, model.own)
+        set_trust(f, model, f.who[0, VEHICLE], True)
         clear(g, 0)
         for c in range(3):
             g.x[c], f.ego[BARE + c], f.ego[OFFSET + c] = left[c], spread, 0.0
@@ -477,52 +486,43 @@ def goes_back(f: Filter, model: Model, own: Floats, rows: Floats, count: int, q:
 
 @inside
 def measure(f: Filter, model: Model, rows: Floats, members: int) -> None:
-    """The relative measurements, linear at the prediction."""
-    g = f.g
-    if members == 0:
-        return
-    if has(g, 0, COMPASS):  # the compass's noise is new at every step
+    """Update by the relative measurements, linear at the prediction."""
+    g, h, member = f.g, f.h, f.member
+    if members > 0 and has(g, 0, COMPASS):  # the compass's noise is new at every step
         i = 3 * g.block[0, COMPASS] + 1
         for j in range(3 * g.vectors[0]):
             g.p[i, j] = g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
     for m in range(members):
-        weigh(f, model, rows, f.who[m, ORDER])
-
-
-@inside
-def weigh(f: Filter, model: Model, rows: Floats, k: int) -> None:
-    """Update by what is measured of member k."""
-    member = f.member
-    g, h = f.g, f.h
-    if not relate(f, model, rows, k):
-        return
-    if member[k, EXTRA_VARIANCE] > 0.0:
-        insert_from_measurement(g, h, k, member[k, EXTRA_VARIANCE])
-        member[k, EXTRA_VARIANCE] = member[k, OUT] = member[k, OUT + 1] = member[k, OUT + 2] = 0.0
-        return
-    innovate(g, h)
-    score(f, h, GATE, False)
-    correct(g, h, 1.0)
-    for c in range(3):
-        if h.block[MEASURED + c]:
-            member[k, OUT + c] = h.three[Q + c]
-            learn_relative(f, c)
-            f.who[k, HITS + c] = f.who[k, HITS + c] + 1 if 0.0 < model.gate < h.three[Q + c] else 0
+        k = f.who[m, ORDER]
+        if not relate(f, model, rows, k):
+            continue
+        if member[k, EXTRA_VARIANCE] > 0.0:
+            insert_from_measurement(g, h, k, member[k, EXTRA_VARIANCE])
+            member[k, EXTRA_VARIANCE] = member[k, OUT] = member[k, OUT + 1] = member[k, OUT + 2] = 0.0
+            continue
+        innovate(g, h)
+        score(f, GATE, False)
+        correct(g, h, 1.0)
+        for c in range(3):
+            if h.block[MEASURED + c]:
+                member[k, OUT + c] = h.three[Q + c]
+                learn_relative(f, c)
+                f.who[k, HITS + c] = f.who[k, HITS + c] + 1 if 0.0 < model.gate < h.three[Q + c] else 0
 
 
 @inside
 def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     """Rows of range, azimuth and inclination of member k in metres, linear at AT; False if its geometry is not
     known."""
-    g, h, row, std = f.g, f.h, f.who[k, INPUT], model.std
+    g, h, row = f.g, f.h, f.who[k, INPUT]
     if not measured_whole(rows, row) and f.member[k, EXTRA_VARIANCE] > 0.0:
         return False
-    x, y, z = subtract(vector_at(f.member[k], AT // 3), vector_at(f.member[0], AT // 3))
-    d, sa, ca, si, ci = load(rows[row], 0, FIVE)
-    ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
-    reach = max(far, model.min_range)
-    flat = max(ground / far, 1e-3) * reach
+    x, y, z = gap = subtract(vector_at(f.member[k], AT // 3), vector_at(f.member[0], AT // 3))
+    d, sa, ca, si, ci = measured = load(rows[row], 0, FIVE)
+    polar, unit = direction(gap), (1.0, 1.0, 1.0)
+    far, (_, turned, raised) = polar[0], residuals(measured, polar)
+    _, flat, reach = metres(polar, unit, model.min_range)
     h.block[MEASURED], h.block[MEASURED + 1] = d >= 0.0, sa != 0.0 or ca != 0.0
     h.block[MEASURED + 2] = si != 0.0 or ci != 0.0
     w = (
@@ -536,12 +536,10 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
         y * z / (flat * reach),
         -flat / reach,
     )
-    turned = angle(sa * x - ca * y, ca * x + sa * y)
-    raised = angle(si * z - ci * ground, ci * z + si * ground)
-    _, b, c = apply(w, (x, y, z))
+    _, b, c = apply(w, gap)
     store(h.three, Z // 3, (d, turned * flat + b, raised * reach + c))
-    a, b, c = (std[0], std[1] * flat, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
-    store(h.three, VARIANCE // 3, (a * a, b * b, c * c))
+    std = metres(polar, model.std, model.min_range) if len(model.std) else unit
+    store(h.three, VARIANCE // 3, times(std, std))
     for c in range(3):
         h.three[VARIANCE + c] *= math.exp(f.ego[LEVEL + c])
         h.three[LIMIT + c] = model.gate

@@ -4,6 +4,8 @@ import math
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part
+from ..compiling.small import add, load, normalised_square, scale, store, subtract, vector_at
+from ..geometry import vector
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -11,6 +13,7 @@ from .cooperative_state import (
     CROSS,
     DT,
     EXTRA_VARIANCE,
+    FIVE,
     FIX,
     HITS,
     INPUT,
@@ -27,7 +30,6 @@ from .cooperative_state import (
     SPAN,
     SPEED,
     STEPS,
-    TAU,
     TRUSTED,
     TURN_MEMORY_S,
     VEHICLE,
@@ -36,8 +38,8 @@ from .cooperative_state import (
     WILD,
     Filter,
     Model,
+    insert_fix_error,
     is_outvoted,
-    measured_vector,
     measured_whole,
     needs_restart,
     set_trust,
@@ -58,7 +60,6 @@ from .gaussian import (
     stretch,
     widen,
 )
-from .messages import vector_at
 from .otherwise import drive, slip
 
 PAIR_TIME = 60.0
@@ -72,7 +73,7 @@ CHANGES, WIDEST = 20.0, 9.0
 
 
 @inside
-def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
     A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
@@ -80,14 +81,14 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
     who = f.who
     for k in range(len(who)):
         who[k, INPUT] = ABSENT
-    for i in range(count):
+    for i in range(len(rows)):
         if f.slot[vehicles[i]] >= 0:
             who[f.slot[vehicles[i]], INPUT] = i
-    outvoted = model.fix_gate > 0.0 and is_outvoted(f, model, own, rows, count)
+    outvoted = model.fix_gate > 0.0 and is_outvoted(f, model, own, rows)
     if outvoted:
-        set_trust(f, who[0, VEHICLE], 1.0, model.own)
+        set_trust(f, model, who[0, VEHICLE], True)
     again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX])
-    again = again and (outvoted or needs_restart(f, own)) and start(f, model, own, rows, count)
+    again = again and (outvoted or needs_restart(f, own)) and start(f, model, own, rows)
     for k in range(1, len(who)):
         j = who[k, VEHICLE]
         if j < 0 or (who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
@@ -101,7 +102,7 @@ def dismiss(f: Filter, model: Model, k: int, doubted: bool) -> None:
     forgotten."""
     j = f.who[k, VEHICLE]
     if f.who[k, INPUT] >= 0 and (doubted or f.status[j, TRUSTED] == 0.0):
-        set_trust(f, j, 0.0, TAU**2 + model.own)
+        set_trust(f, model, j, False)
     for kind in range(KINDS):
         remove(f.g, k, kind)
     f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
@@ -134,15 +135,15 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
         if has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
             if trusted:
-                stretch(g, i, keep - 1.0)
+                stretch(g, i, keep)
             widen(g, i, model.own * fades)
         if k > 0 and has(g, k, RANGED):
             i, holds = 3 * g.block[k, RANGED], math.exp(-own[DT] / PAIR_TIME)
-            stretch(g, i, holds - 1.0)
+            stretch(g, i, holds)
             g.p[i, i] += (1.0 - holds * holds) * model.ranged[1]
     if model.common > 0.0:
         i = 3 * g.block[0, COMMON]
-        stretch(g, i, keep - 1.0)
+        stretch(g, i, keep)
         widen(g, i, model.common * fades)
 
 
@@ -162,27 +163,27 @@ def replace_implausible_velocity(
         variance: of one step's motion in the row.
         unit: m/s of what the row holds.
     """
-    dt, status, q = f.ego[SPAN], f.status[j], 0.0
+    dt, status = f.ego[SPAN], f.status[j]
     since = max(f.ego[CLOCK] - status[SINCE], dt)
     changed = (ACCELERATION * since) ** 2
-    for c in range(3):
-        gap = unit * row[first + c] - status[PACE + c]
-        q += gap * gap / (row[variance + c] / dt**2 + status[PACE + 3 + c] + changed)
+    velocity, noise = scale(vector_at(row, first // 3), unit), scale(vector_at(row, variance // 3), 1.0 / dt**2)
+    before, wide = vector_at(status, PACE // 3), add(vector_at(status, PACE // 3 + 1), (changed, changed, changed))
+    q = normalised_square(subtract(velocity, before), add(noise, wide))
     if model.forget > 0.0:
         more = (min(q, WIDEST) / 3.0 - 1.0) / min(f.ego[STEPS] + 1.0, CHANGES)
         status[LOUDER] = max(status[LOUDER] + (1.0 + status[LOUDER]) * more, 0.0)
     if model.slip > 0.0 and model.fix_gate > 0.0 and q > WILD and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
-        for c in range(3):
-            row[first + c], row[variance + c] = status[PACE + c] / unit, (status[PACE + 3 + c] + changed) * dt * dt
+        store(row, first // 3, scale(before, 1.0 / unit))
+        store(row, variance // 3, scale(wide, dt * dt))
         return
     if model.fix_gate > 0.0 and since < math.inf:
-        x, y, keep = unit * row[first], unit * row[first + 1], math.exp(-since / TURN_MEMORY_S)
-        status[CROSS] = keep * status[CROSS] + status[PACE] * y - status[PACE + 1] * x
+        x, y, keep = velocity[0], velocity[1], math.exp(-since / TURN_MEMORY_S)
+        status[CROSS] = keep * status[CROSS] + before[0] * y - before[1] * x
         status[PACE2] = keep * status[PACE2] + since * (x * x + y * y)
     status[SINCE], status[SLIPS] = f.ego[CLOCK], 0.0
-    for c in range(3):
-        status[PACE + c], status[PACE + 3 + c] = unit * row[first + c], row[variance + c] / dt**2
+    store(status, PACE // 3, velocity)
+    store(status, PACE // 3 + 1, noise)
 
 
 @part
@@ -190,7 +191,7 @@ def stand(f: Filter, rows: Floats, k: int) -> None:
     """Move a member of whose position nothing is known to where the ego measures it, or, where a component is missing,
     somewhere near: its measurement is linear there."""
     g, row, first = f.g, f.who[k, INPUT], 3 * f.g.block[k, PLACE]
-    near, whole, gap = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row), measured_vector(rows, row)
+    near, whole, gap = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row), vector(load(rows[row], 0, FIVE))
     for c in range(3):
         g.x[first + c] = g.x[c] + (gap[c] if whole else near * (1.0 if c < 2 else 0.1))
 
@@ -217,5 +218,4 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
             g.x[first + c] -= age * rows[row, SPEED + c]
     insert_error(g, k, TURN, vector_at(model.turn, 0))
     insert_error(g, k, RANGED, (model.ranged[1], 0.0, 0.0))
-    variance = model.own + (TAU**2 if f.status[vehicle, TRUSTED] == 0.0 else 0.0)
-    insert_error(g, k, ERROR, (variance, variance, variance))
+    insert_fix_error(f, model, k)

@@ -6,9 +6,21 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import add, add_diagonal, inner_product, scale, store, subtract
+from ..compiling.small import (
+    add,
+    add_diagonal,
+    block_at,
+    inner_product,
+    normalised_square,
+    scale,
+    store,
+    subtract,
+    trace,
+    vector_at,
+)
 from ..dead_reckoning import ROUNDING
 from ..gate import FIX_GATE, NOT_REMEMBERED_M2, PATIENCE, SLIP_M2, count, inflation
+from ..geometry import submatrix
 from .cooperative_members import dismiss, replace_implausible_velocity, stand
 from .cooperative_state import (
     AGE,
@@ -55,6 +67,7 @@ from .cooperative_state import (
     WILD,
     Filter,
     Model,
+    has_fixes,
     heard,
     set_trust,
 )
@@ -67,7 +80,6 @@ from .gaussian import (
     IDENTITY,
     MEASURED,
     PLACE,
-    SQUARE,
     TURN,
     VARIANCE,
     add_term,
@@ -84,7 +96,7 @@ from .gaussian import (
     widen,
 )
 from .lasting import usual_error
-from .messages import block_at, three_of, vector_at
+from .messages import three_of
 from .otherwise import JUMPED, LOUDEST_NOISE, SHOWN, drive, learn_fix, score, turned
 
 FADES = 5.0
@@ -277,16 +289,9 @@ def may_slip(row: Floats, variance: int, way2: float) -> float:
 
 @inner
 def use_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool, slip: float) -> None:
-    """Update by the rows of a vehicle's fix, and count those that are rejected in a row."""
-    f.member[k, OUT + 3] = share = update_by_fix(f, model, k, again, q, supported, slip)
-    f.who[k, REJECTED] = f.who[k, REJECTED] + 1 if share < 1.0 else 0
-
-
-@inside
-def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, supported: bool, slip: float) -> float:
-    """Update by the rows of a vehicle's fix, unless its receiver errs more than assumed; the share of its information
-    that it keeps. Causes of receiver errors last, so the n-th fix in a row beyond the gate counts 1 / n; a neighbour's
-    does so where two others are trusted.
+    """Update by the rows of a vehicle's fix, unless its receiver errs more than assumed, and count those that are
+    rejected in a row. Causes of receiver errors last, so the n-th one beyond the gate counts 1 / n; a neighbour's does
+    so where two others are trusted.
 
     Args:
         f: filter.
@@ -298,14 +303,13 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
         slip: of `may_slip`.
     """
     ego = f.ego
-    member = f.member
+    member, share = f.member, 1.0
     g, h, j, used = f.g, f.h, f.who[k, VEHICLE], sum(f.h.block[MEASURED:])
+    judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
         insert_from_measurement(g, h, k, member[k, EXTRA_VARIANCE])
         member[k, EXTRA_VARIANCE] = 0.0
-        return 1.0
-    judged = k > 0 or heard(f, False) > 0  # alone, errors of the receiver and of the odometer cannot be separated
-    if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
+    elif model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if k == 0 and ego[JUMPED] == 0.0 and f.status[j, TRUSTED] > 0.0:
             ego[AGREED] = 0.0
         if not supported:  # neighbours see the ego where the fix is
@@ -313,61 +317,54 @@ def update_by_fix(f: Filter, model: Model, k: int, again: bool, q: float, suppor
             widen(g, 0, inner_product(gap, gap) / 3.0)
         elif f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        set_trust(f, j, 0.0 if supported else 1.0, (TAU**2 if supported else 0.0) + model.own)
+        set_trust(f, model, j, not supported)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             member[0, LOCKED] = 0.0
             fix_terms(f, 0)
             innovate(g, h)
             correct(g, h, 1.0)
-        return 0.0 if supported else 1.0
-    gap = vector_at(h.three, GAP // 3)
-    q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / slip)
-    own, noise = 1e-12, 0.0
-    for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
-        if h.block[MEASURED + c]:
-            own += h.matrix[COV + 4 * c] if judged else ego[BARE + c]
-            noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-ego[LEVEL + FIXES]))
-    share = 1.0
-    if model.fix_gate > 0.0:
-        share = 1.0 / inflation(q, model.fix_gate, member[k, LOCKED])
-        lasts = share < 1.0 and (k == 0 or heard(f, True) > 2)
-        share /= 1.0 + f.who[k, REJECTED] if lasts else 1.0
-        member[k, LOCKED] = count(q, model.fix_gate, member[k, LOCKED], own / (own + noise))
-        holds = ego[AGREED] >= ESTABLISHED or (ego[AGREED] > 0.0 and ego[JUMPED] > 0.0)
-        if not judged and holds and ego[LEVEL + FIXES] <= LOUDEST_NOISE:
-            member[0, LOCKED] = min(member[0, LOCKED], MAX_LOCKOUT)
-    score(f, h, FIX_SCORE, True)
-    correct(g, h, share)
-    return share
+        share = 0.0 if supported else 1.0
+    else:
+        gap = vector_at(h.three, GAP // 3)
+        q = min(as_answered(f, q) if k == 0 else q, inner_product(gap, gap) / slip)
+        own, noise = 1e-12, 0.0
+        for c in range(3):  # alone, the estimate's gain counts: fixes that are rejected make no error likelier
+            if h.block[MEASURED + c]:
+                own += h.matrix[COV + 4 * c] if judged else ego[BARE + c]
+                noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-ego[LEVEL + FIXES]))
+        if model.fix_gate > 0.0:
+            share = 1.0 / inflation(q, model.fix_gate, member[k, LOCKED])
+            lasts = share < 1.0 and (k == 0 or heard(f, True) > 2)
+            share /= 1.0 + f.who[k, REJECTED] if lasts else 1.0
+            member[k, LOCKED] = count(q, model.fix_gate, member[k, LOCKED], own / (own + noise))
+            holds = ego[AGREED] >= ESTABLISHED or (ego[AGREED] > 0.0 and ego[JUMPED] > 0.0)
+            if not judged and holds and ego[LEVEL + FIXES] <= LOUDEST_NOISE:
+                member[0, LOCKED] = min(member[0, LOCKED], MAX_LOCKOUT)
+        score(f, FIX_SCORE, True)
+        correct(g, h, share)
+    member[k, OUT + 3] = share
+    f.who[k, REJECTED] = f.who[k, REJECTED] + 1 if share < 1.0 else 0
 
 
 @part
 def as_answered(f: Filter, q: float) -> float:
     """Squared normalised distance of the ego's fix from the answer, where that from the state is `q`: the answer, which
     is averaged over errors that may not be there, is more certain. For fixes whose errors are states it is `q`."""
-    g, h, square = f.g, f.h, 0.0
+    g, h = f.g, f.h
     if has(g, 0, ERROR) or has(g, 0, COMMON):
         return q
-    for c in range(3):
-        if h.block[MEASURED + c]:
-            gap = h.three[GAP + c] - f.ego[OFFSET + c]
-            square += gap * gap / (f.ego[BARE + c] + h.three[VARIANCE + c])
-    return square
+    gap = subtract(vector_at(h.three, GAP // 3), vector_at(f.ego, OFFSET // 3))
+    return float(normalised_square(gap, add(vector_at(f.ego, BARE // 3), vector_at(h.three, VARIANCE // 3))))
 
 
 @inside
 def wrong(f: Filter, model: Model, k: int, q: float) -> bool:
-    """Whether the receiver of member k errs: on average, or for so long that its fixes would be used again. The ego's
-    counts as wrong in the second way only beside a trusted neighbour."""
-    locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True) > 0)
-    return wrong_on_average(f, model, k, q) or locked
-
-
-@inside
-def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
-    """Whether the mean of a vehicle's clipped innovations is likelier with another error of its fixes than the assumed
-    one; where that error is being estimated, whether the last innovation alone is."""
+    """Whether the receiver of member k errs: for so long that its fixes would be used again, the ego's only beside a
+    trusted neighbour; or on average, if the mean of its clipped innovations is likelier with another error of its fixes
+    than the assumed one; where that error is being estimated, if the last innovation alone is."""
     h, status = f.h, f.status[f.who[k, VEHICLE]]
+    if q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True) > 0):
+        return True
     status[COUNT] = count = min(status[COUNT] + 1.0, WINDOW)
     if status[TRUSTED] == 0.0 and q > max(model.fix_gate, FIX_GATE):
         return True
@@ -404,15 +401,12 @@ def trust(f: Filter, model: Model) -> None:
         best, most = ABSENT, TRUST_LOG_ODDS
         for k in range(len(f.who)):
             j = f.who[k, VEHICLE]
-            if j < 0 or status[j, TRUSTED] > 0.0 or (k > 0 and status[j, USED] == -math.inf):
+            if not has_fixes(f, k) or status[j, TRUSTED] > 0.0:
                 continue
-            first, own = 3 * g.block[k, ERROR], min(model.own + usual_error(f, k), 0.5 * wide)
+            b, own = g.block[k, ERROR], min(model.own + usual_error(f, k), 0.5 * wide)
             unit = wide * wide / (wide - own)
             less = own / wide * unit
-            for c in range(3):
-                for d in range(3):
-                    h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (less if c == d else 0.0)
-            q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
+            q, det = distance(add_diagonal(submatrix(g.p, 3 * b, 3 * b), (less, less, less)), vector_at(g.x, b))
             odds = math.log((1.0 - FAULTY_SHARE) / FAULTY_SHARE) - PENALTY * status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
@@ -451,10 +445,9 @@ def follow_majority(f: Filter, model: Model) -> None:
             best, most = k, alike
     if best < 0 or (most <= heard(f, True) + 1 if own else 2 * most <= others):
         return
-    first, spread = 3 * g.block[best, ERROR], 0.0
-    for c in range(3):
-        spread += (g.p[c, c] + g.p[first + c, first + c] + 2.0 * g.p[c, first + c]) / 3.0
-    way = vector_at(g.x, first // 3)
+    e = 3 * g.block[best, ERROR]
+    spread = trace(submatrix(g.p, 0, 0)) + trace(submatrix(g.p, e, e)) + 2.0 * trace(submatrix(g.p, 0, e))
+    spread, way = spread / 3.0, vector_at(g.x, e // 3)
     if own and inner_product(way, way) > (f.ego[SHOWN] + 2.0 * math.sqrt(3.0 * spread)) ** 2:
         return
     there = add(vector_at(g.x, 0), way)
@@ -467,7 +460,7 @@ def follow_majority(f: Filter, model: Model) -> None:
         if k > 0:
             dismiss(f, model, k, False)
         status[j, REVOKED] += 0.0 if agrees or status[j, TRUSTED] == 0.0 else 1.0
-        set_trust(f, j, 1.0 if agrees else 0.0, (0.0 if agrees else TAU**2) + model.own)
+        set_trust(f, model, j, agrees)
     clear(g, 0)
     store(g.x, 0, there)
     widen(g, 0, spread)
@@ -479,7 +472,7 @@ def errs(f: Filter, k: int) -> bool:
     """Whether a member's fixes, which are not trusted, err beyond doubt; while fixes agree with the ego's position, of
     a neighbour that never lost trust: what all receivers do at once moves no ego."""
     j = f.who[k, VEHICLE]
-    if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
+    if not has_fixes(f, k) or f.status[j, TRUSTED] > 0.0:
         return False
     return difference(f, k, k) > WILD and (k == 0 or f.ego[AGREED] <= 0.0 or f.status[j, REVOKED] == 0.0)
 
@@ -487,11 +480,9 @@ def errs(f: Filter, k: int) -> bool:
 @part
 def difference(f: Filter, k: int, i: int) -> float:
     """Squared normalised difference of the errors of two members' fixes, from 0 where they are the same."""
-    g, h, two = f.g, f.h, 1.0 if i != k else 0.0
-    a, b = 3 * g.block[k, ERROR], 3 * g.block[i, ERROR]
-    for c in range(3):
-        for d in range(3):
-            more = g.p[b + c, b + d] - g.p[a + c, b + d] - g.p[b + c, a + d]
-            h.matrix[SQUARE + 3 * c + d] = g.p[a + c, a + d] + two * more + (1e-6 if c == d else 0.0)
-    gap = subtract(vector_at(g.x, a // 3), scale(vector_at(g.x, b // 3), two))
-    return distance(block_at(h.matrix, SQUARE // 9), gap)[0]
+    g, p, a, b = f.g, f.g.p, 3 * f.g.block[k, ERROR], 3 * f.g.block[i, ERROR]
+    gap, cov = vector_at(g.x, a // 3), submatrix(p, a, a)
+    if i != k:
+        gap = subtract(gap, vector_at(g.x, b // 3))
+        cov = subtract(add(cov, submatrix(p, b, b)), add(submatrix(p, a, b), submatrix(p, b, a)))
+    return distance(add_diagonal(cov, (1e-6, 1e-6, 1e-6)), gap)[0]

@@ -11,8 +11,9 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inside, part, storage
-from ..compiling.small import add, inner_product, load, store, subtract
+from ..compiling.small import add, inner_product, load, normalised_square, scale, store, subtract, vector_at
 from ..gate import CONFIRMED, FIX_GATE, NOT_REMEMBERED_M2, PATIENCE, Vector, vote
+from ..geometry import vector
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -30,7 +31,7 @@ from .gaussian import (
     remove,
     widen,
 )
-from .messages import vector_at
+from .messages import ROW
 
 FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, LAST_FIX, OWN = 0, 3, 6, 9, 12, 13, 16, 17, 20
 """Fields of the ego's row: fix m (NaN for none), its variance m^2, motion m and its variance m^2, three numbers each;
@@ -54,8 +55,8 @@ REVOKED, LOUDER, NOISE, CROSS, PACE2, STATUS = 23, 24, 25, 26, 27, 28
 - CROSS, PACE2: sums, with a memory of TURN_MEMORY_S, of the cross products of velocities that follow each other, and of
   the times between them times their squares, m^2/s: over these, the turn rate.
 """
-NO_POSITION = 1e200
-"""m^2, variance of the mean of no fixes."""
+NO_POSITION, NOWHERE = 1e200, (math.nan,) * 3
+"""m^2, variance of the mean of no fixes; a position that is not known."""
 WILD = 32.0
 """Squared normalised distance from which a velocity is implausible, or an error of fixes is certain."""
 ESTABLISHED, MAX_LOCKOUT = 60.0, 0.99 * PATIENCE
@@ -131,7 +132,7 @@ was: the ego's are those of its fix."""
 FIVE, NO_VOTES = (0.0,) * 5, (0.0,) * 9
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, BARE, LEFT = 20, 26, 32, 38, 51, 54, 63, 66
-AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, UNSAID, OFFSET, OFF, EGO = 73, 74, 75, 76, 84, 93, 94, 97, 98
+AGREED, SINCE_FIX, CORRECTED, ERRORS, VOTES, OFFSET, UNSAID, OFF, EGO = 73, 74, 75, 76, 84, 93, 96, 97, 98
 """Fields of the ego:
 
 - STEPS, CLOCK, SPAN: number of the step; time s, and time since the last step s.
@@ -227,12 +228,11 @@ def copy_rows(source: AnyArray, target: AnyArray) -> None:
 
 
 @part
-def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: int) -> None:
+def begin(f: Filter, model: Model, own: Floats, rows: Floats, ego: int) -> None:
     """The first step: no vehicle has been met."""
     g = f.g
     for j in range(len(f.slot)):
-        for c in range(STATUS):
-            f.status[j, c] = 0.0
+        f.status[j] = 0.0
         f.status[j, TRUSTED] = 1.0 if model.fix_gate == 0.0 or j == ego else 0.0
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
     f.ego[LEFT + 3] = NOT_REMEMBERED_M2
@@ -242,11 +242,11 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
     insert_error(g, 0, COMPASS, (model.bias, model.heading, model.offset))
     insert_error(g, 0, RANGED, (model.ranged[0], 0.0, 0.0))
     insert_error(g, 0, TURN, vector_at(model.turn, 0))
-    start(f, model, own, rows, count)
+    start(f, model, own, rows)
 
 
 @part
-def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
+def start(f: Filter, model: Model, own: Floats, rows: Floats) -> bool:
     """The ego stands somewhere near its fix, which is trusted, or, without one, where most neighbours see it.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
@@ -254,7 +254,7 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
     chance; else nothing is changed, and False returned.
     """
     blind, best, heard, own_votes, g, ego = math.isnan(own[FIX]), ABSENT, 0, 0, f.g, f.who[0, VEHICLE]
-    most = 0 if blind else 1
+    most, count = 0 if blind else 1, len(rows)
     for i in range(-1, count if model.fix_gate > 0.0 or blind else -1):
         agree = 0
         for j in range(-1, count):
@@ -266,28 +266,23 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
             best, most = i, agree
     if own_votes < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
         return False
-    f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, REJECTED], f.member[0, LOCKED] = (
-        model.flat,
-        f.ego[STEPS],
-        0,
-        0.0,
-    )
-    f.ego[AGREED] = 0.0
+    f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, REJECTED] = model.flat, f.ego[STEPS], 0
+    f.ego[AGREED] = f.member[0, LOCKED] = 0.0
     clear(g, 0)
-    set_trust(f, ego, 1.0, model.own)
+    set_trust(f, model, ego, True)
     for c in range(3):
         g.x[c] = own[FIX + c]
         f.ego[LEFT + c] += own[MOTION + c]
     if own_votes <= 1 and best >= 0:
         f.member[0, EXTRA_VARIANCE] = 0.0
-        for c in range(3):
-            g.x[c], own[FIX + c] = seen_from(rows, best, c), math.nan
+        store(g.x, 0, seen_from(rows, best))
+        store(own, FIX // 3, NOWHERE)
         widen(g, 0, model.flat)
     return True
 
 
 @part
-def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
+def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats) -> bool:
     """Whether fixes outvote the one that the ego started at, this one among them, and no neighbours speak for that."""
     if f.ego[VOTES + 7] >= CONFIRMED:
         return False
@@ -295,15 +290,15 @@ def is_outvoted(f: Filter, model: Model, own: Floats, rows: Floats, count: int) 
     before, fix, noise = load(f.ego[VOTES:], 0, NO_VOTES), vector_at(own, FIX // 3), vector_at(own, FIX_VARIANCE // 3)
     votes, left = vote(before, moved, process, fix, noise)
     store(f.ego[VOTES:], 0, votes)
-    return left > 0.0 and speak_for(f, model, own, rows, count, add(vector_at(f.g.x, 0), moved), fix) <= 0.0
+    return left > 0.0 and speak_for(f, model, own, rows, add(vector_at(f.g.x, 0), moved), fix) <= 0.0
 
 
 @part
-def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, here: Vector, there: Vector) -> float:
+def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, here: Vector, there: Vector) -> float:
     """How much nearer neighbours, as they send their positions and the ego measures them, put it to one place than to
     another, as squared normalised distances: what the star has made of them does not count."""
     more = 0.0
-    for i in range(count):
+    for i in range(len(rows)):
         more += off(f, model, own, rows, i, there) - off(f, model, own, rows, i, here)
     return more
 
@@ -312,13 +307,11 @@ def speak_for(f: Filter, model: Model, own: Floats, rows: Floats, count: int, he
 def off(f: Filter, model: Model, own: Floats, rows: Floats, i: int, at: Vector) -> float:
     """Squared normalised distance of a place from where a neighbour that is measured whole, or its range, puts the ego,
     FIX_GATE at most and where nothing does."""
-    far2, near2, variance = 0.0, 0.0, model.own + model.common
+    far, near = subtract(sent_place(rows, i), at), subtract(seen_from(rows, i), at)
+    far2, near2 = inner_product(far, far), inner_product(near, near)
     ranged, turned = model.std[0] ** 2 * math.exp(f.ego[LEVEL]), model.std[1] ** 2 * math.exp(f.ego[LEVEL + 1])
-    for c in range(3):
-        there = rows[i, SOLO + c] + rows[i, AGE] * rows[i, SPEED + c]
-        far2 += (there - at[c]) ** 2
-        near2 += (seen_from(rows, i, c) - at[c]) ** 2
-        variance += (rows[i, SOLO_VARIANCE + c] + own[FIX_VARIANCE + c] + 1.0) / 3.0
+    both = add(vector_at(rows[i], SOLO_VARIANCE // 3), vector_at(own, FIX_VARIANCE // 3))
+    variance = model.own + model.common + 1.0 + sum(both) / 3.0
     if measured_whole(rows, i):
         total = near2 / (variance + ranged + turned * far2)
     else:
@@ -332,9 +325,15 @@ def heard(f: Filter, trusted: bool) -> int:
     ego measures them."""
     count = 0
     for k in range(1, len(f.who)):
-        j = f.who[k, VEHICLE]
-        count += j >= 0 and f.status[j, USED] > -math.inf and (f.status[j, TRUSTED] > 0.0 or not trusted)
+        count += has_fixes(f, k) and (not trusted or f.status[f.who[k, VEHICLE], TRUSTED] > 0.0)
     return count
+
+
+@inside
+def has_fixes(f: Filter, k: int) -> bool:
+    """Whether slot k holds the ego, or a neighbour that has sent a message."""
+    j = f.who[k, VEHICLE]
+    return bool(j >= 0 and (k == 0 or f.status[j, USED] > -math.inf))
 
 
 @part
@@ -352,7 +351,7 @@ def needs_restart(f: Filter, own: Floats) -> bool:
     if f.ego[AGREED] > 0.0:
         return False
     for k in range(1, len(who)):
-        last = k if who[k, VEHICLE] >= 0 and f.status[who[k, VEHICLE], USED] > -math.inf else last
+        last = k if has_fixes(f, k) else last
     error, noise = vector_at(f.g.x, f.g.block[0, ERROR]), sum(vector_at(own, FIX_VARIANCE // 3)) / 3.0
     gap = subtract(error, vector_at(f.g.x, f.g.block[last, ERROR]))
     far = inner_product(error, error)
@@ -361,57 +360,60 @@ def needs_restart(f: Filter, own: Floats) -> bool:
 
 
 @part
-def is_placed(own: Floats, rows: Floats, count: int) -> bool:
+def is_placed(own: Floats, rows: Floats) -> bool:
     """Whether a fix, or what a neighbour sends and the ego measures of it, shows where the ego is."""
     placed = False
-    for i in range(-1, count):
-        placed |= math.isfinite(position(own, rows, i, 0)[0])
+    for i in range(-1, len(rows)):
+        placed |= math.isfinite(position(own, rows, i)[0][0])
     return placed
 
 
 @part
-def set_trust(f: Filter, j: int, trusted: float, variance: float) -> None:
-    """Trust the fixes of vehicle j from now on, or not, whose error has that variance, m^2."""
+def set_trust(f: Filter, model: Model, j: int, trusted: bool) -> None:
+    """Trust the fixes of vehicle j from now on, or not: what error they have begins anew."""
     f.status[j, TRUSTED], f.status[j, COUNT] = trusted, 0.0
-    for c in range(3):
-        f.status[j, MEAN + c] = 0.0
+    store(f.status[j], MEAN // 3, ROW)
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
-        insert_error(f.g, f.slot[j], ERROR, (variance, variance, variance))
+        insert_fix_error(f, model, f.slot[j])
+
+
+@part
+def insert_fix_error(f: Filter, model: Model, k: int) -> None:
+    """Insert the error of the fixes of member k, next to nothing being known of that of one that is not trusted."""
+    variance = model.own + (0.0 if f.status[f.who[k, VEHICLE], TRUSTED] > 0.0 else TAU**2)
+    insert_error(f.g, k, ERROR, (variance, variance, variance))
 
 
 @part
 def mahalanobis2(own: Floats, rows: Floats, i: int, j: int) -> float:
     """Squared Mahalanobis distance of two positions of the ego; infinite if one is missing."""
-    total = 0.0
-    for c in range(3):
-        (x, p), (y, q) = position(own, rows, i, c), position(own, rows, j, c)
-        total += (x - y) ** 2 / (p + q)
+    (x, p), (y, q) = position(own, rows, i), position(own, rows, j)
+    total = normalised_square(subtract(x, y), add(p, q))
     return total if math.isfinite(total) else math.inf
 
 
 @part
-def position(own: Floats, rows: Floats, i: int, c: int) -> tuple[float, float]:
-    """Component c m of where the ego is, and its variance m^2: by a neighbour's message less the measured vector, or,
-    -1, by its own fix; NaN if that is missing."""
+def position(own: Floats, rows: Floats, i: int) -> tuple[Vector, Vector]:
+    """Where the ego is, m, and the variance m^2 of that: by a neighbour's message less the measured vector, or, -1, by
+    its own fix; NaN if that is missing."""
     if i < 0:
-        return own[FIX + c], own[FIX_VARIANCE + c]
+        return vector_at(own, FIX // 3), vector_at(own, FIX_VARIANCE // 3)
     there = rows[i, AGE] >= 0.0 and measured_whole(rows, i)
-    return seen_from(rows, i, c) if there else math.nan, rows[i, SOLO_VARIANCE + c] + 1.0
+    return seen_from(rows, i) if there else NOWHERE, add(vector_at(rows[i], SOLO_VARIANCE // 3), (1.0, 1.0, 1.0))
 
 
 @part
-def seen_from(rows: Floats, row: int, c: int) -> float:
-    """Component c m of where the ego is by a neighbour's message; NaN if that has no position."""
-    position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - measured_vector(rows, row)[c]
-    return position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan
+def seen_from(rows: Floats, row: int) -> Vector:
+    """Where the ego is by a neighbour's message, m; NaN if that has no position."""
+    there = subtract(sent_place(rows, row), vector(load(rows[row], 0, FIVE)))
+    return there if rows[row, SOLO_VARIANCE] < NO_POSITION else NOWHERE
 
 
 @part
-def measured_vector(rows: Floats, row: int) -> Vector:
-    """The measured vector to a neighbour, m."""
-    d, sa, ca, si, ci = load(rows[row], 0, FIVE)
-    return d * si * ca, d * si * sa, d * ci
+def sent_place(rows: Floats, row: int) -> Vector:
+    """Where a neighbour is by its message, m."""
+    return add(vector_at(rows[row], SOLO // 3), scale(vector_at(rows[row], SPEED // 3), rows[row, AGE]))  # type: ignore[no-any-return]
 
 
 @inside

@@ -23,6 +23,8 @@ from ..compiling.small import (
     store,
     subtract,
     times,
+    trace,
+    vector_at,
     zeros,
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
@@ -42,7 +44,7 @@ from ..gate import (
     vote,
 )
 from ..geometry import Numbers, axes, direction, incomplete, metres, residuals, vector, whole
-from .messages import ROW, VARIANCE, Star, moved_of, position_of, process_of, relative_of, variance_of, vector_at
+from .messages import ROW, VARIANCE, Star, moved_of, position_of, process_of, relative_of, variance_of
 
 STATE, BEFORE, VOTES = (0.0,) * 13, (0.0,) * 14, (0.0,) * 9
 
@@ -131,7 +133,7 @@ def go_back(star: Star, gates: Gates, state: Floats, n: int) -> Lanes:
     if q <= o + FIX_GATE and o + NOT_REMEMBERED_M2 <= spread[0] and left <= o:
         return o
     gap, other = subtract(there, at), distance(subtract(fix, there), add_diagonal(spread, variance))
-    apart, wide, gain = inner_product(gap, gap), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
+    apart, wide, gain = inner_product(gap, gap), trace(spread), gain_of(ego[:9], variance)
     what, evidence, since = remember(q, other, FIX_GATE, gain, apart, wide, memory[12], memory[13])
     begins, back, flat = what - 0.5, what - 1.5, o + NOT_REMEMBERED_M2
     nothing = diagonal((flat, flat, flat))

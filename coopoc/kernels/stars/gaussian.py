@@ -13,19 +13,23 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part, storage
 from ..compiling.small import (
+    add,
+    apply,
+    block_at,
     inverse,
-    less_applied,
+    less_inner_product,
     less_transposed_product,
     minus_product,
     negate,
-    plus_applied,
     scale,
     store,
+    subtract,
     transpose,
+    vector_at,
 )
-from ..compiling.vectors import LANES, less, plus, put, take
+from ..compiling.vectors import LANES, plus, put, take
 from ..geometry import Numbers
-from .messages import BLOCK, ROW, block_at, vector_at
+from .messages import BLOCK, ROW
 
 PLACE, ERROR, TURN, FRESH, COMMON, COMPASS, RANGED = range(7)
 """Kinds of vectors. Of every member: position m; error of its fixes m; errors of its odometry (heading rad, scale,
@@ -60,8 +64,8 @@ THREE = CURVE + 1
 none; out, innovations, these squared and normalised, 0 where nothing was measured, whitened innovations, and their
 variances; and of range, azimuth and inclination 1 / m^2, one over the squared distance, else 0."""
 MEASURED = TERMS + 1
-COV, SQUARE, TURNED, MATRIX = range(9 * TERMS, 9 * TERMS + 36, 9)
-"""Behind the matrices of the terms: H P H^T, out, scratch, and derivatives of `otherwise.turned`."""
+COV, TURNED, MATRIX = range(9 * TERMS, 9 * TERMS + 27, 9)
+"""Behind the matrices of the terms: H P H^T, out, and derivatives of `otherwise.turned`."""
 
 
 class Rows(NamedTuple):
@@ -96,7 +100,7 @@ def lanes(g: Gaussian) -> int:
 
 
 @inside
-def three_rows(rows: Floats, i: int, wide: int) -> tuple[float, float, float]:
+def three_rows(rows: Floats, i: int, wide: int) -> Numbers:
     """LANES of three rows, `wide` of them apart."""
     return take(rows, i), take(rows, i + wide), take(rows, i + 2 * wide)
 
@@ -117,7 +121,7 @@ def insert(g: Gaussian, member: int, kind: int) -> int:
 
 
 @part
-def insert_error(g: Gaussian, member: int, kind: int, variance: tuple[float, float, float]) -> None:
+def insert_error(g: Gaussian, member: int, kind: int, variance: Numbers) -> None:
     """Insert a vector of mean 0 and of these variances, unless all are 0: there is no such error."""
     if sum(variance) > 0.0:
         i = insert(g, member, kind)
@@ -144,9 +148,8 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
         g.x[i] = g.x[k]
         for j in range(n):
             g.p[i, j] = g.p[k, j]
-    for j in range(n):
-        for c in range(3):
-            g.p[j, 3 * b + c] = g.p[j, 3 * last + c]
+        for j in range(n):
+            g.p[j, i] = g.p[j, k]
     clear(g, 3 * last)
     moved = g.vectors[1 + last]
     g.vectors[1 + b] = moved
@@ -156,16 +159,16 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
 
 
 @part
-def stretch(g: Gaussian, i: int, more: float) -> None:
-    """Multiply a vector by 1 + more."""
+def stretch(g: Gaussian, i: int, share: float) -> None:
+    """Multiply a vector by a number."""
     n = 3 * g.vectors[0]
     for c in range(3):
-        g.x[i + c] += more * g.x[i + c]
+        g.x[i + c] *= share
         for k in range(n):
-            g.p[i + c, k] += more * g.p[i + c, k]
+            g.p[i + c, k] *= share
     for k in range(n):
         for c in range(3):
-            g.p[k, i + c] += more * g.p[k, i + c]
+            g.p[k, i + c] *= share
 
 
 @inside
@@ -228,10 +231,10 @@ def project(g: Gaussian, h: Rows) -> None:
     gap, one, two, three = vector_at(h.three, Z // 3), ROW, ROW, ROW
     for k in range(h.block[TERMS]):
         b, w = h.block[k], block_at(h.matrix, k)
-        gap = less_applied(gap, w, vector_at(g.x, b))
-        one = plus_applied(one, w, vector_at(gain, b))
-        two = plus_applied(two, w, vector_at(gain, third + b))
-        three = plus_applied(three, w, vector_at(gain, 2 * third + b))
+        gap = subtract(gap, apply(w, vector_at(g.x, b)))
+        one = add(one, apply(w, vector_at(gain, b)))
+        two = add(two, apply(w, vector_at(gain, third + b)))
+        three = add(three, apply(w, vector_at(gain, 2 * third + b)))
     store(h.three, GAP // 3, gap)
     store(h.matrix, COV // 9, (*one, *two, *three))
 
@@ -272,14 +275,17 @@ def add_curvature(h: Rows) -> None:
     d + u + (v^2 + w^2) / 2 d, v - u v / d and w - u w / d. Of each error the part counts that its own measurement
     leaves.
     """
-    u = v = w = 0.0
-    for c in range(3):
-        p = h.matrix[COV + 4 * c]
-        r = p * h.three[VARIANCE + c] / (p + h.three[VARIANCE + c]) if h.block[MEASURED + c] else p
-        u, v, w = (r, v, w) if c == 0 else (u, r, w) if c == 1 else (u, v, r)
+    u, v, w = left_of(h, 0), left_of(h, 1), left_of(h, 2)
     h.three[VARIANCE] += 0.5 * h.three[CURVE] * (v * v + w * w)
     h.three[VARIANCE + 1] += h.three[CURVE] * u * h.matrix[COV + 4]
     h.three[VARIANCE + 2] += h.three[CURVE] * u * h.matrix[COV + 8]
+
+
+@inside
+def left_of(h: Rows, c: int) -> float:
+    """Variance of row c that its measurement leaves."""
+    p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
+    return float(p * r / (p + r) if h.block[MEASURED + c] else p)
 
 
 @inside
@@ -307,10 +313,10 @@ def correct(g: Gaussian, h: Rows, share: float) -> None:
         i, a = 3 * k * wide, scale(vector_at(gain, k), share)
         b, c = scale(vector_at(gain, third + k), share), scale(vector_at(gain, 2 * third + k), share)
         for j in range(lanes(g)):
-            u, v, w = three_rows(gain, j, wide)
+            rows = three_rows(gain, j, wide)
             for row in range(3):
                 at = i + row * wide + j
-                put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
+                put(p, at, less_inner_product(take(p, at), (a[row], b[row], c[row]), rows))
 
 
 @part
@@ -350,7 +356,7 @@ def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> N
 
 
 @part
-def distance(s: tuple[float, ...], x: tuple[float, ...]) -> tuple[float, float]:
+def distance(s: Numbers, x: Numbers) -> tuple[float, float]:
     """x^T S^-1 x of a symmetric 3 x 3 matrix S, also where x and S have no height, and its determinant."""
     a, b = s[3] / s[0], s[6] / s[0]
     d, cross = s[4] - a * s[3], s[7] - b * s[3]

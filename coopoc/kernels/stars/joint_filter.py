@@ -18,22 +18,23 @@ from ..compiling.compile import as_written, inner, inside, storage
 from ..compiling.small import (
     add,
     add_diagonal,
+    apply,
+    block_at,
     choose_each,
     diagonal,
     from_upper,
     inverse,
-    less_applied,
     less_transposed_product,
     load,
     minus_product,
     negate,
     over,
-    plus_applied,
     scale,
     store,
     subtract,
     times,
     transpose,
+    vector_at,
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
 from ..gate import BACK
@@ -47,7 +48,6 @@ from .messages import (
     Estimates,
     Measurements,
     Star,
-    block_at,
     clear,
     gather,
     moved_of,
@@ -57,7 +57,6 @@ from .messages import (
     relative_of,
     star_within,
     variance_of,
-    vector_at,
 )
 
 LEAST_KNOWN = 1e-4
@@ -134,7 +133,7 @@ def substitute(factor: Floats, x: Floats, n: int, stride: int) -> None:
     for k in range(n - 1, -1, -1):
         v = vector_at(x, k)
         for j in range(k + 1, n):
-            v = less_applied(v, block_at(factor, k * stride + j), vector_at(x, j))
+            v = subtract(v, apply(block_at(factor, k * stride + j), vector_at(x, j)))
         store(x, k, v)
 
 
@@ -410,7 +409,7 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, laplacian
             if incomplete(polar):
                 is_placed = placed(joint, k, polar)
                 weight, vector = scale(weight, is_placed), scale(vector, is_placed)
-            vector = plus_applied(vector, weight, ahead) if stage == 1 else vector
+            vector = add(vector, apply(weight, ahead)) if stage == 1 else vector
             add_relative(a, eta, joint.stride, k, n, weight, vector)
         store(joint.scratch, 0, negate(eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch)))
         substitute(joint.factor, eta, n, joint.stride)

@@ -22,7 +22,8 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..compiling.small import inner_product, store, subtract
+from ..compiling.small import inner_product, store, subtract, trace, vector_at
+from ..geometry import submatrix
 from .cooperative_state import (
     CLOCK,
     COUNT,
@@ -36,15 +37,14 @@ from .cooperative_state import (
     OUT,
     TRUSTED,
     UNSAID,
-    USED,
     VEHICLE,
     WHOLE,
     Filter,
     Model,
+    has_fixes,
     heard,
 )
 from .gaussian import ABSENT, COMMON, ERROR, has
-from .messages import vector_at
 
 RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
 """Of the ego's fixes: sums of their errors m on each axis and of 1, fading; s since the last one; and number, sum and
@@ -64,12 +64,12 @@ def usual_error(f: Filter, but: int) -> float:
     g, few, n = f.g, f.few, 0
     for k in range(len(f.who)):
         j = f.who[k, VEHICLE]
-        if k == but or j < 0 or (k > 0 and f.status[j, USED] == -math.inf):
+        if k == but or not has_fixes(f, k):
             continue
-        status, i = f.status[j], 3 * g.block[k, ERROR]
+        status, b = f.status[j], g.block[k, ERROR]
         if status[TRUSTED] == 0.0:
-            store(few[n], 0, vector_at(g.x, i // 3))
-            few[n, OF_ERROR] = g.p[i, i] + g.p[i + 1, i + 1] + g.p[i + 2, i + 2]
+            store(few[n], 0, vector_at(g.x, b))
+            few[n, OF_ERROR] = trace(submatrix(g.p, 3 * b, 3 * b))
         elif status[COUNT] >= MIN_VEHICLES:
             store(few[n], 0, vector_at(status, MEAN // 3))
             few[n, OF_ERROR] = status[NOISE] / status[COUNT]

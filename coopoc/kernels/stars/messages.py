@@ -12,9 +12,9 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, choose_each, load, scale, store
-from ..compiling.vectors import LANES, Lanes, choose, take, unrolled
-from ..geometry import with_std
+from ..compiling.small import add, choose_each, load, scale, store, vector_at
+from ..compiling.vectors import LANES, Lanes, choose, take
+from ..geometry import Numbers, with_std
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
 """Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
@@ -113,18 +113,6 @@ class Star(NamedTuple):
     relative: Floats
 
 
-@unrolled
-def vector_at(memory: Any, index: Any) -> Any:
-    """Vector number `index` of those of three numbers that stand in memory one after the other."""
-    return memory.read(index, 3)
-
-
-@unrolled
-def block_at(memory: Any, index: Any) -> Any:
-    """Matrix number `index` of those of 3 x 3 numbers."""
-    return memory.read(index, 9)
-
-
 @inside
 def moved_of(star: Star, k: int) -> Lanes:
     """Motion m of member k since the last step."""
@@ -194,7 +182,7 @@ def gather(
     for k in range(n):
         link = measurements.start[t] + k - 1
         star.member[k] = j = measurements.ego if k == 0 else measurements.neighbour[link]
-        star.previous[k], status = -1, 5 * k
+        star.previous[k] = -1
         for i in range(old):
             if before.member[i] == j:
                 star.previous[k] = i
@@ -204,10 +192,7 @@ def gather(
             sent = t if k == 0 else measurements.newest[run, link]
             when = sent if sent >= 0 else t
             again = previous >= 0 and before.status[last_status + SENT, lane] == sent
-            star.status[status + SENT, lane] = sent
-            star.status[status + USES, lane] = before.status[last_status + USES, lane] + 1.0 if again else 1.0
-            star.status[status + AGE, lane] = t - when
-            star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
+            uses, held = before.status[last_status + USES, lane] + 1.0 if again else 1.0, 1.0 if sent >= 0 else 0.0
             at, variance = three_of(measurements.broadcast, run, when, j), three_of(model.broadcast, run, when, j)
             if k == 0:
                 at, variance = three_of(measurements.gnss, run, when, j), three_of(model.fixes, run, when, j)
@@ -216,7 +201,8 @@ def gather(
                 at, variance = ROW, (NOWHERE, NOWHERE, NOWHERE)
             velocity, process = three_of(measurements.velocity, run, when, j), three_of(model.process, run, when, j)
             put_lane(star.motion, 12 * k, lane, (*velocity, *process, *at, *variance))
-            star.status[status + NEW, lane] = 1.0 if there and (k == 0 or measurements.fresh[run, link]) else 0.0
+            new = 1.0 if there and (k == 0 or measurements.fresh[run, link]) else 0.0
+            put_lane(star.status, 5 * k, lane, (float(sent), uses, float(t - when), held, new))
             if k > 0:
                 std = model.relative_std if len(model.relative_std) else UNIT
                 put_lane(star.relative, 8 * k, lane, with_std(measurements.relative[run, link], std))
@@ -253,14 +239,14 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
 
 
 @inside
-def three_of(values: Floats, run: int, t: int, member: int) -> tuple[float, float, float]:
+def three_of(values: Floats, run: int, t: int, member: int) -> Numbers:
     """Three of what is broadcastable to (R, T, N, 3)."""
     i, j, k = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
     return values[i, j, k, 0], values[i, j, k, 1], values[i, j, k, 2]
 
 
 @inside
-def put_lane(memory: Floats, at: int, lane: int, values: tuple[float, ...]) -> None:
+def put_lane(memory: Floats, at: int, lane: int, values: Numbers) -> None:
     """Write numbers of one run."""
     for i in range(len(values)):
         memory[at + i, lane] = values[i]

@@ -39,7 +39,8 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
-from ..compiling.small import add, inner_product, scale, store
+from ..compiling.small import add, inner_product, scale, store, trace, vector_at
+from ..geometry import Numbers, submatrix
 from ..odometry_fault import DECISIVE, SPEED_MEMORY_S
 from .cooperative_state import (
     AGREED,
@@ -100,12 +101,10 @@ from .gaussian import (
     TURNED,
     VARIANCE,
     Q,
-    Rows,
     has,
     stretch,
     widen,
 )
-from .messages import vector_at
 
 HEADING, SCALE, OF_COMPASS, OF_RANGE, OF_SCALE, SLIPS, ALONE, LEVELS = range(8)
 """Indices in TOLD: the ego's errors (rad, 1, rad, m, 1), whether it slips, whether it has left its star, and the
@@ -113,7 +112,7 @@ factors of standard deviations."""
 
 
 @part
-def turned(f: Filter, k: int, moved: tuple[float, float, float]) -> tuple[float, float, float]:
+def turned(f: Filter, k: int, moved: Numbers) -> Numbers:
     """(1 + s) R(b) m, and its derivatives by b and s in TURNED; m itself where odometry does not err, or fixes correct
     it."""
     g, w = f.g, f.h.matrix[TURNED:]
@@ -129,7 +128,7 @@ def turned(f: Filter, k: int, moved: tuple[float, float, float]) -> tuple[float,
 
 
 @part
-def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt: float) -> None:
+def drive(f: Filter, model: Model, k: int, moved: Numbers, dt: float) -> None:
     """Move a member by its odometry, whose errors decay."""
     g, w = f.g, f.h.matrix[TURNED:]
     first, way = 3 * g.block[k, PLACE], turned(f, k, moved)
@@ -147,7 +146,7 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     for j in range(n):
         for c in range(2):
             g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
-    stretch(g, i, keep - 1.0)
+    stretch(g, i, keep)
     for c in range(3):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
 
@@ -163,8 +162,7 @@ def average(f: Filter, model: Model) -> None:
     g, few, n, where = f.g, f.few, 3, len(f.few[0]) - 1
     for c in range(3):
         few[c, where], ego[ANSWER + c] = c, g.x[c]
-        for d in range(3):
-            ego[COVARIANCE + 3 * c + d] = g.p[c, d]
+    store(ego, COVARIANCE // 9, submatrix(g.p, 0, 0))
     for k in range(len(f.who) - 1, -1, -1):
         if has(g, k, TURN):
             for c in range(3):
@@ -412,9 +410,9 @@ def slip(f: Filter, model: Model, own: Floats) -> None:
 
 
 @part
-def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
+def score(f: Filter, gate: float, whole: bool) -> None:
     """Count the rows of an update, each, or as the fix that they are; beyond the gate no more."""
-    square = 0.0
+    h, square = f.h, 0.0
     for c in range(3):
         if h.block[MEASURED + c] and h.three[SCHUR + c] > 0.0:
             q = h.three[Q + c]
@@ -458,12 +456,12 @@ agree with the estimated error of these fixes to end it: all that it sends may b
 
 
 @part
-def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints) -> None:
     """Multiply the variances of a step's motions by their level, that of each vehicle's velocities, and UNTRUSTED."""
     level = math.exp(f.ego[LEVEL + MOTIONS])
     for c in range(3):
         own[MOTION_VARIANCE + c] *= level * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
-    for i in range(count):
+    for i in range(len(rows)):
         status = f.status[vehicles[i]]
         doubted = status[TRUSTED] == 0.0 and status[COUNT] < AGREEING and status[USED] > -math.inf
         for c in range(3):
@@ -503,7 +501,7 @@ def corrected(f: Filter) -> None:
 @part
 def ego_variance(f: Filter) -> float:
     """m^2, of the three axes together."""
-    return float(f.g.p[0, 0] + f.g.p[1, 1] + f.g.p[2, 2])
+    return float(trace(submatrix(f.g.p, 0, 0)))
 
 
 @part

@@ -20,6 +20,7 @@ from ..compiling.small import (
     add,
     add_diagonal,
     apply,
+    block_at,
     choose_each,
     diagonal,
     inner_product,
@@ -30,7 +31,9 @@ from ..compiling.small import (
     scale,
     store,
     subtract,
+    trace,
     transpose,
+    vector_at,
     zeros,
 )
 from ..compiling.vectors import LANES, Lanes, choose, take
@@ -48,7 +51,6 @@ from .messages import (
     Estimates,
     Measurements,
     Star,
-    block_at,
     gather,
     moved_of,
     new_estimates,
@@ -57,7 +59,6 @@ from .messages import (
     relative_of,
     star_within,
     variance_of,
-    vector_at,
 )
 
 NEWTON_STEPS, BISECT_AFTER, STEP_TOLERANCE = 60, 20, 1e-8
@@ -111,17 +112,9 @@ def run_intersection(
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
     most = measurements.most
-    fusion = Fusion(
-        np.zeros((3 * most, LANES)),
-        np.zeros((9 * most, LANES)),
-        np.zeros((9 * most, LANES)),
-        np.zeros((3 * most, LANES)),
-        np.ones((most, LANES)),
-        np.zeros((1, LANES)),
-        split,
-        robust,
-        naive,
-    )
+    vectors, matrices = np.zeros((2, 3 * most, LANES)), np.zeros((2, 9 * most, LANES))
+    sources = vectors[0], matrices[0], matrices[1], vectors[1], np.ones((most, LANES)), np.zeros((1, LANES))
+    fusion = Fusion(*sources, split, robust, naive)
     for first in range(0, runs, LANES):
         star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
         gates = gates_within(1)
@@ -213,12 +206,6 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
         store(fusion.used, k, (choose(has_position, counts, o),))
         store(fusion.gap, k, gap)
         add_source(fusion, k, scale(theirs, f), scale(noise, f))
-
-
-@inside
-def trace(a: Numbers) -> float:
-    """Of a 3 x 3 matrix."""
-    return a[0] + a[4] + a[8]
 
 
 @inside

@@ -125,14 +125,14 @@ def stream_step(
         answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
     """
     if f.g.vectors[0] == 0:
-        if not (is_placed(own, rows, len(vehicles)) or isfinite(start[0])):
+        if not (is_placed(own, rows) or isfinite(start[0])):
             return False
-        begin(f, model, own, rows, len(vehicles), 0)
+        begin(f, model, own, rows, 0)
         if isfinite(start[0]):
             f.ego[STEPS], f.ego[VOTES + 7], f.member[0, EXTRA_VARIANCE] = 1, CONFIRMED, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
-    step(f, tries, model, own, rows, vehicles, len(vehicles))
+    step(f, tries, model, own, rows, vehicles)
     for i in range(12):
         answer[i] = f.ego[ANSWER + i]
     for i in range(len(vehicles)):
