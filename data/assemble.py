@@ -1,13 +1,14 @@
 """Rows at their own times on equal steps: drives -> Fleet, measurements in a plane -> Recording in body frames."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from numpy import nan
 
 from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
-from coopoc.arrays import Bools, Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints, number
 from coopoc.world.plausible import MAX_SPEED, plausible
 
 SAME_INSTANT = 1e-6
@@ -29,14 +30,12 @@ PLANE_STD = 0.01
 def assemble(
     vehicle: Sequence[str],
     t: Floats,
-    position: Floats,
-    velocity: Floats | None = None,
+    numbers: Floats,
     *,
     dt: float | None = None,
     max_gap: float | None = None,
     any_scale: bool = False,
-    file: str = "rows",
-    name: str = "",
+    path: Path = Path("rows"),
     source: str = "",
 ) -> Fleet:
     """Fleet of L rows; vehicles keep the order of their first row, absence is a missing row.
@@ -44,14 +43,13 @@ def assemble(
     Args:
         vehicle: (L,) ids.
         t: (L,) s.
-        position: (L, 3) m.
-        velocity: (L, 3) m/s; None: the backward difference u_t = (x_t - x_{t-1})/dt, with u_0 := u_1.
+        numbers: (L, 6) positions m and velocities m/s; (L, 3) positions alone, whose velocity is the backward
+            difference u_t = (x_t - x_{t-1})/dt, with u_0 := u_1.
         dt: s; None keeps the stamps, a number resamples every vehicle linearly.
         max_gap: s, the longest gap between two rows of a vehicle that `dt` bridges; in a longer one it is absent. None:
             as `longest_gap`.
         any_scale: True accepts positions that do not look like metres and seconds.
-        file: named in errors.
-        name: of the Fleet.
+        path: that names the Fleet, and its file in errors.
         source: of the Fleet.
 
     Raises:
@@ -62,14 +60,12 @@ def assemble(
     >>> assemble(["a", "a"], np.array([0, 0.1]), np.array([[0.0, 0, 0], [1, 0, 0]])).velocity[0, 0, 0]
     np.float64(10.0)
     """
-    for field, value in (("dt", dt), ("max_gap", max_gap)):
-        if value is not None and not value > 0:
-            raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
+    file = path.name
+    check_intervals(dt=dt, max_gap=max_gap)
     if not len(t):
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
     column, names = pd.Series(vehicle).factorize()
     ids = tuple(names)
-    numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, float)
     stamps = np.round(np.asarray(t, float), 6)
     order = np.argsort(column, kind="stable")
     back = np.flatnonzero((np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0))
@@ -106,7 +102,14 @@ def assemble(
             "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out.",
         )
     x, u = table[..., :3], table[..., 3:]
-    return Fleet(ids, grid, x, u if u.size else backward_difference(grid, x, ids, file), name=name, source=source)
+    return Fleet(ids, grid, x, u if u.size else backward_difference(grid, x, ids, file), name=path.stem, source=source)
+
+
+def check_intervals(**seconds: float | None) -> None:
+    """InputError for an interval that is given, and no number > 0."""
+    for field, value in seconds.items():
+        if value is not None:
+            number(field, value, 1e-12, allowed="a number > 0 s", hint="Give seconds.")
 
 
 def longest_gap(t: Floats, dt: float, max_gap: float | None) -> float:
@@ -150,7 +153,7 @@ def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floa
     """
     stamp = t[np.clip(np.searchsorted(t, grid - SAME_INSTANT), 0, len(t) - 1)]
     grid = np.where(abs(grid - stamp) <= SAME_INSTANT, stamp, grid)
-    out = np.column_stack([np.interp(grid, t, v, left=nan, right=nan) for v in values.T])
+    out = np.column_stack([np.interp(grid, t, v) for v in values.T])
     return np.where(covered(t, grid, max_gap, 0.0)[:, None], out, nan)
 
 
@@ -190,16 +193,12 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
         later = np.searchsorted(t, t[:-1] + NOISE_STDS * std / MAX_TYPICAL_SPEED, "right").clip(max=len(t) - 1)
         each = np.linalg.norm((position[later] - position[:-1])[:, :2], axis=1) / (t[later] - t[:-1])
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
-    (west, south), (east, north) = places.min(0).tolist(), places.max(0).tolist()
-    if (
-        0 < speed < MIN_TYPICAL_SPEED
-        and max(east - west, north - south) < REGION
-        and max(-west, east) <= 360
-        and max(-south, north) <= 180
-    ):
+    low, high = places.min(0), places.max(0)
+    on_earth = (np.maximum(-low, high) <= [360, 180]).all()
+    if 0 < speed < MIN_TYPICAL_SPEED and on_earth and (high - low).max() < REGION:
         raise InputError(
             f"{file}: columns x, y",
-            f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}",
+            ", ".join(f"{least:.8g}..{most:.8g}" for least, most in zip(low, high, strict=True)),
             "look like degrees, must be metres in a local frame",
             "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.",
         )

@@ -1,7 +1,7 @@
 """ROS 1 and 2 bags as rows of a log: NavSatFix, Odometry, Imu, PoseStamped and Range, one namespace per vehicle."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import pandas as pd
 from coopoc.arrays import one_of
 from coopoc.errors import InputError, MissingLibraryError, said
 
+from .cells import Names
 from .log.units import QUATERNION, Rows, Summary, of_kinds
 
 ORIENTATION = "orientation.x orientation.y orientation.z orientation.w"
@@ -53,8 +54,8 @@ def read_bag(
     path: Path,
     summary: Summary,
     *,
-    columns: Mapping[str, str],
-    kinds: Mapping[str, str],
+    columns: Names,
+    kinds: Names,
     ignore: Sequence[str],
     stamps: str = "header",
     truth: str = "",
@@ -83,10 +84,11 @@ def read_bag(
         InputError: no bag, none of these messages, or no such topic.
         MissingLibraryError: rosbags is not installed.
     """
+    file = path.name
     if columns or kinds:
         raise InputError(
             "columns, kinds",
-            path.name,
+            file,
             "apply to tables, and this is a bag",
             'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".',
         )
@@ -101,7 +103,7 @@ def read_bag(
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = {c.topic: c.msgtype in READ and c.topic not in ignore for c in reader.connections}
             for topic in filter(None, [truth, *(name for name in ignore if name.startswith("/"))]):
-                one_of(f"{path.name}: topic", topic, sorted(topics))
+                one_of(f"{file}: topic", topic, sorted(topics))
             wanted = [c for c in reader.connections if topics[c.topic]]
             what, fields = {}, {}
             for c in wanted:
@@ -110,7 +112,7 @@ def read_bag(
             for c in reader.connections:
                 topic = c.topic
                 if not topics[topic]:
-                    summary.unused[f"{path.name}: topic {topic} ({c.msgtype})"] += c.msgcount
+                    summary.unused[f"{file}: topic {topic} ({c.msgtype})"] += c.msgcount
                 elif what[topic] == "odometry" and of[topic][1]:
                     fields[topic] = [f"pose.{field}" for field in POSE.split()]
             for number, (c, received, raw) in enumerate(reader.messages(connections=wanted) if wanted else (), 1):
@@ -125,13 +127,13 @@ def read_bag(
             for field in frame.columns[frame.columns.str.endswith("covariance")]:
                 frame = frame.join(pd.DataFrame(np.stack(frame[field].tolist()), frame.index).add_prefix(f"{field}_"))
             (vehicle, partner), true = of[topic]
-            kinds_read = kinds_of(frame, true, summary, f"{path.name}: {topic}")
+            kinds_read = kinds_of(frame, true, summary, f"{file}: {topic}")
             kinds_read = kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true))
-            parts[topic] = of_kinds(kinds_read, path.name)
+            parts[topic] = of_kinds(kinds_read, file)
     except InputError:
         raise
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all
-        raise InputError(path.name, said(error), "must be a ROS bag", "Record it again, or reindex it.") from None
+        raise InputError(file, said(error), "must be a ROS bag", "Record it again, or reindex it.") from None
     if behind:
         summary.assume(
             f"times are by stamps={stamps}; headers are between {min(behind):.3g} and {max(behind):.3g} s before they "
@@ -139,14 +141,14 @@ def read_bag(
         )
     if all(rows["true"].all() for rows in parts.values()):
         allowed = f"must hold {', '.join(name.rpartition('/')[2] for name in READ)}"
-        raise InputError(path.name, "0 messages", allowed, "Check the topics with: ros2 bag info.")
+        raise InputError(file, "0 messages", allowed, "Check the topics with: ros2 bag info.")
     rows = pd.concat(parts).sort_values("row", kind="stable")
     by, turns = rows.index.get_level_values(0).map(what), rows["kind"] == "yaw_rate"
     rows = rows[~(turns & (by == "odometry") & rows["vehicle"].isin(rows["vehicle"][turns & (by == "imu")]))]
     return _by_number(rows.reset_index(drop=True), summary)
 
 
-def _vehicles(kinds: Mapping[str, str], truth: str, bag: str) -> dict[str, tuple[tuple[str, str], bool]]:
+def _vehicles(kinds: Names, truth: str, bag: str) -> dict[str, tuple[tuple[str, str], bool]]:
     """Topic -> the vehicle and the partner that it names, and whether it is of the truth.
 
     >>> topics = {"/mocap/red/pose": "pose", "/mocap/blue/pose": "pose", "/red/odom": "odometry"}

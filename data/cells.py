@@ -10,18 +10,21 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+import pandas as pd
+from pandas import DataFrame
 
 from coopoc.arrays import Bools, Floats, named, number, one_of
 from coopoc.errors import InputError, said, suggestion, unknown
 from coopoc.formats.values import MAX_NUMBER
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 TABLES = (".csv", ".parquet", ".jsonl")
+Names = Mapping[str, str]
+"""Name here -> name in a file; of kinds the other way round."""
+Factors = Mapping[str, float]
+"""Name of a column, kind, vehicle or pair -> number."""
 WHOLE = re.compile(r"^(\d+)\.0$")
 """What a spreadsheet or pandas makes of a whole number beside empty cells: 7.0 is the name 7."""
 MAX_COLUMNS = 5000
@@ -44,6 +47,8 @@ USUAL_HEADERS = {
 }
 """Words in headers that others give to the columns, in wide tables."""
 PLAIN = "must be a finite number as -1234.5, without a unit, separators of thousands or N, S, E, W"
+SECONDS = "must be seconds, or a date as 2024-05-01T12:00:00Z, to which pandas.to_datetime converts others"
+"""What a number, and a time, is in a cell."""
 OTHER_MEANINGS = {"rate", "vertical", "acc", "accel", "accuracy", "std", "sigma", "error", "variance", "cov"}
 """Words beside which these mean something else."""
 
@@ -52,7 +57,7 @@ LARGEST_TABLE = 2**27
 """Numbers in a Parquet table: 1 GB."""
 
 
-def read_frame(path: Path, *text: str) -> "pd.DataFrame":
+def read_frame(path: Path, *text: str) -> DataFrame:
     """Table of a .parquet, .jsonl (an object per line) or (any other ending) CSV file.
 
     Args:
@@ -62,8 +67,6 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     Raises:
         InputError: a damaged file, one column, no header, two columns of one name, or a row longer than the header.
     """
-    import pandas as pd
-
     try:
         if path.suffix.lower() == ".jsonl":
             frame = pd.read_json(path, lines=True, dtype=False, convert_dates=False, precise_float=True)
@@ -81,7 +84,7 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     return frame
 
 
-def _read_parquet(path: Path) -> "pd.DataFrame":
+def _read_parquet(path: Path) -> DataFrame:
     """The table without the index that pandas numbers rows with, words as objects.
 
     A column, a list or a word that is the same throughout takes no room in the file, and what the footer says of sizes
@@ -111,7 +114,7 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
                 at = file.tell() + page[3]
         within(count)
     table = read_table(path, read_dictionary=[b".".join(chunk[3]).decode() for chunk in chunks])
-    frame: pd.DataFrame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
+    frame: DataFrame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
     words = frame.select_dtypes("category")
     within(len(frame) * max((len(str(word)) for name in words for word in words[name].cat.categories), default=0) // 8)
     return frame.astype(dict.fromkeys(words, object))
@@ -151,32 +154,26 @@ def headers(path: Path) -> list[str]:
         return []
 
 
-def numeric(frame: "pd.DataFrame", column: str, file: str) -> Floats:
-    """A column as finite numbers; InputError with the row of the first cell that is none."""
-    import pandas as pd
-
+def numeric(frame: DataFrame, column: str, file: str, allowed: str = PLAIN) -> Floats:
+    """A column as finite numbers; InputError with the row of the first cell that is none, and what is allowed."""
     cells = frame[column]
     if cells.dtype.kind in "bmM":
-        raise InputError(
-            f"{file}: column {column}", f"of type {cells.dtype}", "must be a finite number", "Convert the column."
-        )
+        raise InputError(f"{file}: column {column}", f"of type {cells.dtype}", allowed, "Convert the column.")
     try:
         values = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
         values = pd.to_numeric(cells.map(lambda cell: str(cell)[:300]), errors="coerce").to_numpy(dtype=float)
-    _refuse(cells, ~(abs(values) <= MAX_NUMBER), file, PLAIN)
+    _refuse(cells, ~(abs(values) <= MAX_NUMBER), file, allowed)
     return values
 
 
-def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
+def seconds(frame: DataFrame, column: str, file: str) -> Floats:
     """A column of times: numbers are seconds, dates become seconds since 1970 (UTC), durations seconds.
 
     >>> import pandas as pd
     >>> seconds(pd.DataFrame({"t": pd.to_datetime([0, 100], unit="ms")}), "t", "drive.parquet").tolist()
     [0.0, 0.1]
     """
-    import pandas as pd
-
     column_values = frame[column]
     kind = column_values.dtype.kind
     if kind == "O" and len(column_values) and not pd.to_numeric(column_values, errors="coerce").notna().any():
@@ -184,15 +181,7 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
         if dates.notna().all():
             column_values, kind = dates, "M"
     if kind not in "mM":
-        try:
-            return numeric(frame, column, file)
-        except InputError as error:
-            raise InputError(
-                error.field,
-                error.value,
-                "must be seconds, or a date as 2024-05-01T12:00:00Z",
-                "Correct the cell, or remove the row; if all are so, convert them by pandas.to_datetime.",
-            ) from None
+        return numeric(frame, column, file, SECONDS)
     _refuse(column_values, column_values.isna().to_numpy(), file, "must be a time")
     if kind == "m":
         return np.asarray(column_values.dt.total_seconds(), float)
@@ -200,7 +189,7 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, float)  # in ns years end at 2262
 
 
-def factors(mapping: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
+def factors(mapping: Factors | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
     """Numbers by name; InputError for a name that is none of `names`, for 0, and for a deviation or a scale of times
     that is not positive."""
     for name, value in named(field, mapping or {}, f"Give {field}={{name: number}}.").items():
@@ -217,13 +206,13 @@ def factors(mapping: Mapping[str, float] | None, names: Collection[str], field: 
     return dict(mapping or {})
 
 
-def words(frame: "pd.DataFrame", column: str, file: str) -> list[str]:
+def words(frame: DataFrame, column: str, file: str) -> list[str]:
     """A column of names; InputError with the row of the first empty cell."""
     cells = frame[column]
     named_cells = filled(cells)
     _refuse(cells.astype(object).where(named_cells, "empty"), ~named_cells, file, "must be a name")
-    number, each = cells.astype(str).factorize()
-    return list(np.array([WHOLE.sub(r"\1", cell.strip()) for cell in each], object)[number].tolist())
+    texts = cells.astype(str)
+    return texts.map({text: WHOLE.sub(r"\1", text.strip()) for text in texts.unique()}).tolist()
 
 
 def filled(cells: "pd.Series[Any]") -> Bools:
@@ -232,8 +221,8 @@ def filled(cells: "pd.Series[Any]") -> Bools:
 
 
 def named_columns(
-    frame: "pd.DataFrame", columns: Mapping[str, str], allowed: Sequence[str], needed: Sequence[str], file: str
-) -> "pd.DataFrame":
+    frame: DataFrame, columns: Names, allowed: Sequence[str], needed: Sequence[str], file: str
+) -> DataFrame:
     """The frame with our names of its columns.
 
     Args:
@@ -278,9 +267,7 @@ def usual_key(header: str) -> str:
     return next(usual, "") if parts.isdisjoint(OTHER_MEANINGS) else ""
 
 
-def missing_column(
-    file: str, column: str, frame: "pd.DataFrame", allowed: str, key: str = "", more: str = ""
-) -> InputError:
+def missing_column(file: str, column: str, frame: DataFrame, allowed: str, key: str = "", more: str = "") -> InputError:
     """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant, and
     `more`."""
     key, names = key or column, list(frame.columns)
@@ -297,9 +284,7 @@ def missing_column(
     )
 
 
-def _read_csv(path: Path, text: Sequence[str]) -> "pd.DataFrame":
-    import pandas as pd
-
+def _read_csv(path: Path, text: Sequence[str]) -> DataFrame:
     separator, header, first = _first_lines(path)
     _check_header(path, header)
     if len(first) > len(header):  # the only row that pandas does not compare with the header
@@ -310,7 +295,7 @@ def _read_csv(path: Path, text: Sequence[str]) -> "pd.DataFrame":
         form["float_precision"] = "round_trip"  # the default became exact in 3.1
     form["converters"] = {name: str.strip for name in header if name.strip() in text}
     try:
-        table: pd.DataFrame = pd.read_csv(path, **form)
+        table: DataFrame = pd.read_csv(path, **form)
         return table
     except pd.errors.ParserError as error:
         wide = re.search(r"fields in line (\d+), saw (\d+)", str(error))

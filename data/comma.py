@@ -47,10 +47,8 @@ def read_segment(path: Path, summary: Summary) -> Rows:
     fixes, _, true = tables
     fixes.loc[fixes["fast"] < MIN_COG_SPEED_M_S, "compass_deg"] = np.nan
     summary.assume("the heading is the course that the receiver states while it moves")
-    names = ("latitude", "longitude", "height")
-    tables[2] = true[["t"]].assign(
-        true=1.0, **dict(zip(names, pymap3d.ecef2geodetic(*true[[*"xyz"]].to_numpy().T), strict=True))
-    )
+    latitude, longitude, height = pymap3d.ecef2geodetic(*true[[*"xyz"]].to_numpy().T)
+    tables[2] = true[["t"]].assign(true=1.0, latitude=latitude, longitude=longitude, height=height)
     return of_kinds(pd.concat(tables, ignore_index=True).assign(vehicle=path.name), path.name)
 
 

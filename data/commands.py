@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import tyro
+from tabulate import tabulate
 
 from coopoc import InputError, plot_recording, plot_track
 from coopoc.arrays import one_of
@@ -20,8 +21,6 @@ def list_() -> None:
 
     Example: coopoc data list
     """
-    from tabulate import tabulate
-
     print(tabulate(list_datasets(), headers="keys", tablefmt="github"), end="\n\n")
     rows = [
         {
@@ -101,8 +100,6 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
         path: a file or a folder: tables, NMEA, a ROS bag, PyFG, and options; see docs/your_data.md.
         picture: its file; default: the log's name with -check.png, in the working folder.
     """
-    from tabulate import tabulate
-
     from .log.check import check as checked
 
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")

@@ -92,8 +92,7 @@ def public() -> Mapping[str, Entry]:
 
 def _entry(name: str, files: Mapping[str, Mapping[str, Any]], base: str = "", **fields: str) -> Entry:
     entry = {
-        file: (urljoin(base, row["from"]) if base else "", int(row["bytes"]), str(row["sha256"]))
-        for file, row in files.items()
+        file: (urljoin(base, row["from"]) if base else "", row["bytes"], row["sha256"]) for file, row in files.items()
     }
     return Entry(name, files=entry, **fields)
 

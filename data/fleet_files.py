@@ -2,11 +2,11 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from coopoc import Fleet, InputError
 from coopoc.formats.values import read_table as read_rows
@@ -14,16 +14,14 @@ from coopoc.paths import write
 from coopoc.text import spreadsheet
 
 from .assemble import assemble
-from .cells import factors, named_columns, numeric, read_frame, seconds, words
+from .cells import Factors, Names, factors, named_columns, numeric, read_frame, seconds, words
 
 NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
 FCD = {"id": "", "x": "", "y": "", "z": "0", "angle": "", "slope": "0", "speed": ""}
 """Attributes of a vehicle in SUMO's file, and what stands for one that is not there; an empty one is refused."""
 
 
-def read_table(
-    path: Path, *, columns: Mapping[str, str] | None = None, scale: Mapping[str, float] | None = None, **options: Any
-) -> Fleet:
+def read_table(path: Path, *, columns: Names | None = None, scale: Factors | None = None, **options: Any) -> Fleet:
     """Fleet of a CSV or Parquet file; without vx, vy, vz the velocity is the backward difference.
 
     Args:
@@ -43,21 +41,11 @@ def read_table(
     frame = named_columns(frame, names, (*NEEDED, *VELOCITY), used, path.name)
     source = f"table {path.name}" + ("" if has_velocity else ", velocity by backward difference")
     factor = factors(scale, (*NEEDED[1:], *VELOCITY))
-    t, *axes = (
+    t, *numbers = (
         factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name) for name in used[1:]
     )
-    numbers = np.column_stack(axes)
     ids = [re.sub("^'(?=[=+@-])", "", name) for name in words(frame, "id", path.name)]  # of `spreadsheet`
-    return assemble(
-        ids,
-        t,
-        numbers[:, :3],
-        numbers[:, 3:] if has_velocity else None,
-        **options,
-        file=path.name,
-        name=path.stem,
-        source=source,
-    )
+    return assemble(ids, t, np.column_stack(numbers), **options, path=path, source=source)
 
 
 def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
@@ -98,7 +86,7 @@ def read_tum(path: Path, **options: Any) -> Fleet:
     ids = [file.stem for file, table in zip(files, tables, strict=True) for _ in table]
     t, *x = np.concatenate(tables)[:, :4].T
     source = f"TUM {path.name}, velocity by backward difference"
-    return assemble(ids, t, np.stack(x, 1), **options, file=path.name, name=path.stem, source=source)
+    return assemble(ids, t, np.stack(x, 1), **options, path=path, source=source)
 
 
 def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Fleet:
@@ -116,8 +104,6 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
         InputError: no XML, an attribute that is missing or no finite number (with the vehicle's row, counted through
             the file), or what Fleet refuses.
     """
-    import pandas as pd
-
     rows = []
     now = ""
     try:
@@ -136,6 +122,5 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
     ahead = np.column_stack([np.sin(angle) * np.cos(incline), np.cos(angle) * np.cos(incline), np.sin(incline)])
     centre, velocity = np.column_stack([x, y, z]) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
     source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"
-    return assemble(
-        words(frame, "id", path.name), t, centre, velocity, **options, file=path.name, name=path.stem, source=source
-    )
+    numbers = np.hstack([centre, velocity])
+    return assemble(words(frame, "id", path.name), t, numbers, **options, path=path, source=source)

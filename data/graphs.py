@@ -62,9 +62,8 @@ def read_pyfg_rows(path: Path, summary: Summary, **_: Any) -> Rows:
     measured = {"range": ranges.distance, "range_std": np.sqrt(ranges.variance)}
     parts.append({"t": ranges.stamps, "vehicle": one, "partner": other, **measured})
     for rows, more in ((marks, {}), (graph.is_pose, {"heading": graph.orientation[graph.is_pose, 0], "true": 1.0})):
-        parts.append(
-            {"vehicle": who[rows], **{"t": graph.stamps[rows], "x": position[rows, 0], "y": position[rows, 1]}, **more}
-        )
+        x, y = position[rows, :2].T
+        parts.append({"vehicle": who[rows], "t": graph.stamps[rows], "x": x, "y": y, **more})
     others = (graph.relative_point, graph.pose_prior, graph.point_prior, edges)
     summary.refuse("measured points and poses other than odometry", sum(map(len, others)) - used)
     return of_kinds(pd.concat(map(pd.DataFrame, parts), ignore_index=True), path.name)

@@ -16,7 +16,15 @@ from coopoc.text import short_repr
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import wrap
 
-from .assemble import PLANE_STD, backward_difference, check_size, check_time, interpolate, planar_recording
+from .assemble import (
+    PLANE_STD,
+    backward_difference,
+    check_intervals,
+    check_size,
+    check_time,
+    interpolate,
+    planar_recording,
+)
 from .log.frames import RATE_BIAS_STD, SCALE_STD
 from .log.heading import Signal, between, step_means
 
@@ -86,8 +94,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
 
     Source: Leung, Halpern, Barfoot, Liu, IJRR 30(8) 2011.
     """
-    if not dt > 0:
-        raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
+    check_intervals(dt=dt)
     folder = given_path(folder)
     numbers = [n for n in range(1, 10) if (folder / f"Robot{n}_Groundtruth.dat").exists()] or [1]
     truths = [_read(folder / f"Robot{n}_Groundtruth.dat", "time x y heading", strictly=True) for n in numbers]
@@ -104,15 +111,16 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         )
     check_size((end - start) / dt, len(numbers), sum(map(len, truths + wheels)), dt, folder.name)
     t = dt * np.arange(int((end - start) / dt) + 1)
-    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], 1)
-    odometry = np.stack([step_means(Signal(a[:, 0] - start, a[:, 1:]), t) for a in wheels], axis=1)
+    vicon, logged = ([Signal(a[:, 0] - start, a[:, 1:]) for a in tables] for tables in (truths, wheels))
+    poses = np.stack([interpolate(*robot, t, max_gap) for robot in vicon], 1)
+    odometry = np.stack([step_means(robot, t) for robot in logged], axis=1)
     file = folder / "Landmark_Groundtruth.dat"
     marks = _read(file, "subject x y x_std y_std")[:, :3] if file.is_file() else np.empty((0, 3))
     table = _measurements(folder, numbers)
     table[:, 0] -= start
     member = {n: k for k, n in enumerate([*numbers, *marks[:, 0].tolist()])}
     table[:, 2] = [member.get(subject, -1) for subject in table[:, 2].tolist()]
-    exact = [interpolate(a[:, 0] - start, a[:, 1:], table[:, 0], max_gap) for a in truths]
+    exact = [interpolate(*robot, table[:, 0], max_gap) for robot in vicon]
     at = [np.broadcast_to([x, y, nan], (len(table), 3)) for x, y in marks[:, 1:].tolist()]
     every = np.stack([*exact, *at, np.full((len(table), 3), nan)])
     here, there = (every[table[:, k].astype(int), np.arange(len(table))] for k in (1, 2))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from coopoc import InputError, MissingLibraryError
 
@@ -35,8 +36,6 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
         InputError: no sentence with a fix.
         MissingLibraryError: pynmeagps is not installed.
     """
-    import pandas as pd
-
     try:
         from pynmeagps import NMEAReader
     except ImportError:

@@ -10,11 +10,11 @@ from typing import Any
 
 from coopoc import Fleet, InputError
 from coopoc.arrays import instance
-from coopoc.errors import suggestion, unknown
+from coopoc.errors import unknown
 from coopoc.plugins import find, in_file, names
 from coopoc.world.storage import read_recording
 
-from .cells import TABLES
+from .cells import TABLES, Names
 from .fetch import bring
 from .fleet_files import read_fcd, read_table, read_tum, tum_files
 from .log import read as logs
@@ -124,8 +124,7 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
             raise InputError("options", sorted(options), f"{name} is bundled and takes none", "Leave them out.")
         registered = find("coopoc.datasets", name)
         made = registered if isinstance(registered, Fleet) else registered()
-        whole: Fleet = parted(instance(f"what data {name!r} gives", made, Fleet, "Return coopoc.Fleet(...)."), **part)
-        return whole
+        return parted(instance(f"what data {name!r} gives", made, Fleet, "Return coopoc.Fleet(...)."), **part)
     there(name)
     path = Path(name)
     chosen = chosen or detect(path, options.get("columns"))
@@ -133,7 +132,7 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
     if chosen not in readers:
         raise unknown("format", chosen, readers, "Or leave it out.")
     read = _read(readers[chosen], path, options)
-    truth = read if chosen in DRIVES else read.truth
+    truth: Fleet | None = read if chosen in DRIVES else read.truth
     if truth is None:
         raise InputError(
             path.name,
@@ -141,8 +140,7 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
             "is a log without one: there is nothing to score against",
             "Add a table truth.csv to its folder, pass truth=, or take co.read_log.",
         )
-    fleet: Fleet = parted(truth, **part)
-    return fleet
+    return parted(truth, **part)
 
 
 def read_log(name_or_path: str | Path, **options: Any) -> Log:
@@ -182,7 +180,7 @@ def kind_of(name_or_path: str | Path) -> str:
     return str(options.get("format") or detect(Path(name), options.get("columns")))
 
 
-def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
+def detect(path: Path, columns: Names | None = None) -> str:
     """Format of a file or folder by its name and, for tables and folders, by its contents.
 
     Args:
@@ -214,7 +212,7 @@ def list_datasets() -> list[dict[str, Any]]:
     return [{column: card(name)[column] for column in columns} for name in DATASETS]
 
 
-def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
+def _real(path: Path, columns: Names | None = None) -> str:
     """Format of measurements, "" for anything else."""
     if (path / "Barcodes.dat").is_file():
         return "mrclam"
@@ -238,7 +236,7 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
     accepted += ["since", "until"]
     for name in options:
         if name not in accepted:
-            raise unknown("option", name, accepted, suggestion(name, accepted, "Leave it out."))
+            raise unknown("option", name, accepted, "Leave it out.")
     if not (path.is_file() or path.is_dir()):
         raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
     for each in (path, *path.rglob("*")):

@@ -10,7 +10,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from coopoc import InputError, Recording
+from coopoc import Fleet, InputError, Recording
 from coopoc.errors import suggestion
 from coopoc.paths import given_path
 from coopoc.plugins import in_file, names
@@ -18,6 +18,7 @@ from coopoc.plugins import in_file, names
 from .fetch import bring, local
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Drive = TypeVar("Drive", Fleet, Recording)
 STEP_ROUNDING = 1e-9
 """Share of a step by which a time may miss one."""
 
@@ -95,7 +96,7 @@ def there(name: str) -> None:
         )
 
 
-def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:
+def parted(data: Drive, since: float | None = None, until: float | None = None) -> Drive:
     """The part of a Fleet or a Recording from `since` to before `until` s after its first step; of a Recording a note
     names it. Without both it is the whole.
 
@@ -111,7 +112,7 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
         raise InputError(
             "since, until", actual, f"must leave two steps of the {length}", "Count from the first step, 0 s."
         )
-    part = data.between(first, last)
+    part: Drive = data.between(first, last)
     if isinstance(part, Recording):
         return replace(
             part, notes=(*part.notes, f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s")

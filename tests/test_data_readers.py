@@ -90,7 +90,7 @@ def test_a_bad_table_names_the_thing_and_the_mend(tmp_path, case):
 
 def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path):
     (tmp_path / "a.csv").write_text(GOOD)
-    with refused("dt = 0 s: must be > 0"):
+    with refused("dt = 0: must be a number > 0 s"):
         load_fleet(tmp_path / "a.csv", dt=0)
     (tmp_path / "b.csv").write_text(GOOD.replace("b,0.1", "b,0.13"))
     fleet = load_fleet(tmp_path / "b.csv", dt=0.05)

@@ -44,7 +44,7 @@ from .estimates import (
 from .motion import HOLDS, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
 from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
-from .residuals import Check, filtered, without, without_wild
+from .residuals import Check, Row, filtered, without, without_wild
 
 WRONG_UNITS = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
@@ -102,7 +102,7 @@ def check(log: Log) -> Check:
             that are not known.
     """
     first = filtered(log)
-    first = without_wild(replace(first, failing=_failing(first) if log.recording.body is None else {}))
+    first = without_wild(replace(first, failing={} if first.in_body else _failing(first)))
     rows = _vehicles(first)
     least = {"speed_excess": LEAST_SCALE, "turned": LEAST_TURN, "yaw_rate_bias": LEAST_DRIFT, "fixes_late_s": BEHIND}
     drifts = [
@@ -112,11 +112,11 @@ def check(log: Log) -> Check:
     ]
     alike = not drifts and not any(_beyond(row, "nis", OUTLYING) for row in rows)
     late = [row["vehicle"] for row in rows if _late(first, row)]
-    result = on_time(first if log.recording.body else without(first, drifts), alike, against_truth(first, late))
+    result = on_time(first if first.in_body else without(first, drifts), alike, against_truth(first, late))
     result = replace(result, vehicles=_vehicles(result))
     if log.truth is not None and not any(of_ranges(result)):
         result = against_truth(result, [*late, *np.array(result.world.ids)[result.ahead != 0]])
-    elif log.recording.body is None:  # odometry that errs says nothing of others
+    elif not first.in_body:  # odometry that errs says nothing of others
         result = without(_wider(result), drifts)
     result = misplaced(result)
     result = replace(result, measurements=measurements(result))
@@ -143,7 +143,7 @@ def _wider(c: Check) -> Check:
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
     rows, rec, truth = [], c.world, c.log.truth
-    turned = "turned" if c.log.recording.body is None else "yaw_rate_bias"
+    turned = "yaw_rate_bias" if c.in_body else "turned"
     errors = "speed_excess", turned, "fixes_late_s" if truth is None else "late_s", "beside_east", "beside_north"
     for column, name in enumerate(rec.ids):
         fixed = np.isfinite(c.normalised[:, column])
@@ -231,11 +231,12 @@ def _noisier(c: Check, column: int) -> str:
     off = pd.DataFrame((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[[0, 1]].dropna()
     size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / (c.fix_noise * (6 * np.log(2)) ** 0.5)
     scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated
-    if len(off) < TENTHS * LEAST_COUNT / 2 or scatter.max() < CONFIDENT_RATIO * max(1.0, scatter.median()):
+    most = scatter.max()
+    if len(off) < TENTHS * LEAST_COUNT / 2 or most < CONFIDENT_RATIO * max(1.0, scatter.median()):
         return ""
-    at = (rec.t - rec.t[0])[off.index[size > 0.5 * scatter.max()]]
+    at = (rec.t - rec.t[0])[off.index[size > 0.5 * most]]
     return (
-        f"its fixes scatter by {scatter.max():.2g} times their standard deviation from {at[0]:.3g} to {at[-1]:.3g} s: "
+        f"its fixes scatter by {most:.2g} times their standard deviation from {at[0]:.3g} to {at[-1]:.3g} s: "
         "did the receiver lose its base or satellites? Give columns of std, or leave these fixes out."
     )
 
@@ -283,13 +284,14 @@ def _of_vehicles(c: Check) -> list[str]:
     return [sentence for row in c.vehicles for sentence in _of_vehicle(c, row)]
 
 
-def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
+def _of_vehicle(c: Check, row: Row) -> list[str]:
     """Of one; odometry that fails, or noise that is not as stated, where nothing else explains it."""
     name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
     column, sentences = c.world.ids.index(name), list[str]()
     say = sentences.append
-    share = c.wild[column] / max(row["fixes"] + c.wild[column], 1)
-    if share > OUTLIER_SHARE and c.wild[column] > LEAST_OUTLIERS:
+    wild = c.wild[column]
+    share = wild / max(row["fixes"] + wild, 1)
+    if share > OUTLIER_SHARE and wild > LEAST_OUTLIERS:
         say(
             f"{name}: {share:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: outliers, "
             "which a filter without a gate follows."
@@ -337,7 +339,7 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
         if back.sum() >= 3 and back.mean() > LEAST_BACK:
             cause = f"fixes go back on {back.mean():.0%} of the way: speeds are negative in reverse."
         say(f"{name}: its odometry fails, or its fixes drift {c.failing[name]}: {cause}")
-    elif c.log.recording.body is not None and abs(row.get("speed_excess", 0.0)) > DIVERGED:
+    elif c.in_body and abs(row.get("speed_excess", 0.0)) > DIVERGED:
         say(
             f"{name}: its filter has diverged, with speeds too large by {row['speed_excess']:.0%}: are yaw rates "
             "and bearings in rad and anticlockwise, bearings from the forward axis, and speeds negative in reverse?"
@@ -373,17 +375,17 @@ def _of_vehicle(c: Check, row: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def _beyond(row: Mapping[str, Any], name: str, least: float, errors: float = SURE_ERRORS) -> bool:
+def _beyond(row: Row, name: str, least: float, errors: float = SURE_ERRORS) -> bool:
     """Whether an estimate of a row is larger than that, and than so many standard errors."""
     return float(abs(row.get(name) or 0.0)) > max(least, errors * (row.get(f"{name}_error") or 0.0))
 
 
-def _may(row: Mapping[str, Any], name: str, least: float) -> str:
+def _may(row: Row, name: str, least: float) -> str:
     """Whether an estimate "is" or "may be" more than chance; "" if not."""
     return "is" if _beyond(row, name, least) else MAY * _beyond(row, name, least, PERHAPS)
 
 
-def _late(c: Check, row: Mapping[str, Any]) -> bool:
+def _late(c: Check, row: Row) -> bool:
     """Whether the odometry of a row is late beside the truth."""
     return _beyond(row, "late_s", max(LEAST_LAG, 0.1 * c.world.dt), SURE_CLOCK_ERRORS)
 
@@ -415,7 +417,7 @@ def _of_clocks(c: Check) -> list[str]:
     ]
 
 
-def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
+def _with_fixes(c: Check, row: Row) -> str:
     """Whether the fixes of a vehicle are as late beside the truth as its odometry, and what mends it."""
     off, made, _ = causes(c)
     name, late = row["vehicle"], row["late_s"]
@@ -504,19 +506,18 @@ def _unseen(c: Check) -> Iterator[str]:
     if not every:
         yield "errors of fixes, none of which changes while nothing moves"
     turns = ("turned", LEAST_TURN, "rad, of the direction of the odometry")
-    if c.log.recording.body is not None:
+    if c.in_body:
         turns = ("yaw_rate_bias", LEAST_DRIFT, "rad/s, of the yaw rates")
     for name, least, what in (("speed_excess", LEAST_SCALE, "as a share, of the speeds"), turns):
         errors = {row["vehicle"]: SURE_ERRORS * row.get(f"{name}_error", inf) for row in c.vehicles}
         if blind := _below(errors, 2 * least):
             yield f"errors, {what} of {blind}"
-    late = {row["vehicle"]: row.get("late_s_error", inf) for row in c.vehicles}
-    if blind := _below(
-        {who: SURE_CLOCK_ERRORS * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LEAST_LAG
-    ):
+    unsure = dict(zip(c.world.ids, c.unsure, strict=True))
+    late = {row["vehicle"]: min(row.get("late_s_error", inf), unsure[row["vehicle"]]) for row in c.vehicles}
+    if blind := _below({who: SURE_CLOCK_ERRORS * error for who, error in late.items()}, 2 * LEAST_LAG):
         yield f"errors, s, of the clocks of {blind}"
-    fixes = np.isfinite(c.fix[..., 0]).sum(0)
-    if few := [who for who in every if fixes[c.world.ids.index(who)] < LEAST_COUNT]:
+    fixes = dict(zip(c.world.ids, np.isfinite(c.fix[..., 0]).sum(0), strict=True))
+    if few := [who for who in every if fixes[who] < LEAST_COUNT]:
         yield f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes"
 
 

@@ -88,21 +88,21 @@ def factors(
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
-    none, count = no_estimate(x.shape[1]), x.shape[1] + 1
+    none, count, size = no_estimate(x.shape[1]), x.shape[1] + 1, len(y)
     every = hstack([csr_array(each) for each in (y[:, None], x, x if z is None else z)], "csr")
     if groups is not None:
         every = less_means(every, groups)
     whole, varying = (np.asarray(abs(each).sum(0)) for each in (x, every[:, 1:count]))
     seen = varying > CONSTANT * whole
     causes, k = 1 + np.flatnonzero(seen), int(seen.sum())
-    if len(y) < MIN_SAMPLES or not k:
+    if size < MIN_SAMPLES or not k:
         return none
     yx, z = every[:, np.r_[0, causes]], every[:, count - 1 + causes]
     row, cause = z.nonzero()
     other = yx[row].tocoo()  # what a row adds to the sums: of many causes it has a few
     row, cause = row[other.row], cause[other.row]
     products = (z[row, cause].conj() * other.data).real, (row, cause * (k + 1) + other.col)
-    terms = csr_array(products, (len(y), k * (k + 1)))
+    terms = csr_array(products, (size, k * (k + 1)))
 
     def gap_of(factor: Floats) -> Floats:
         return np.asarray(abs(yx @ np.r_[1.0, -factor]))
@@ -116,14 +116,14 @@ def factors(
             used = used & (gap <= OUTLYING * np.median(gap[used]))
         return factor
 
-    at = np.arange(len(y))
+    at = np.arange(size)
     value = fitted(at >= 0)
     before, left = (float(np.median(gap_of(factor))) for factor in (0.0 * value, value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    count = min(parts, max(len(y) // 2, min(len(y), FEW_PARTS)))
+    count = min(parts, max(size // 2, min(size, FEW_PARTS)))
     changes = value - np.stack(
-        [fitted(at * count // len(y) != part) for part in progress_bar(range(count), "check", delay=2.0)]
+        [fitted(at * count // size != part) for part in progress_bar(range(count), "check", delay=2.0)]
     )
     none.value[seen], none.error[seen] = value, lasting(changes)
     return none
@@ -188,7 +188,7 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     rec = c.world
     fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
     heading = getattr(c.log.truth, "heading", None)
-    if c.log.recording.body and heading is not None and np.isfinite(heading[:, column]).any():
+    if c.in_body and heading is not None and np.isfinite(heading[:, column]).any():
         velocity = plane(c.log.recording.velocity[0, :, column]) * np.exp(1j * heading[:, column])
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     walk = rec.dt * np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor))
@@ -197,7 +197,8 @@ def moves(c: Check, column: int, means: int = 1) -> AnyArray:
     parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
     pace = np.gradient(path, rec.dt)
     numbers = np.stack([fixes, path, pace, np.gradient(pace, rec.dt), rec.t])[:, parts].mean(2)
-    (fixes, path), gaps, at = numbers[:2], gaps[parts[:, 0]], parts[:, 0]
+    (fixes, path), at = numbers[:2], parts[:, 0]
+    gaps = gaps[at]
     least = (MOVED_STDS if means == 1 else MOVED_STDS / 3) * c.fix_noise / means**0.5
     for places, far in ((path, least), (fixes, 2 * least)):
         pairs, last = [], 0
@@ -392,8 +393,9 @@ def lag_of_fixes(c: Check, column: int) -> float:
     path = path if truth is None else plane(truth.position[:, column])
     there = np.isfinite(fixes)
     lags = np.arange(-LONGEST_LAG, LONGEST_LAG, LAG_STEP)
-    places = [fixes[there], *(np.interp(rec.t[there] - lag, rec.t, path, nan, nan) for lag in [0.0, *lags])]
-    moved = np.stack(places)[:, LEAST_COUNT:] - np.stack(places)[:, :-LEAST_COUNT]
+    later = (np.interp(rec.t[there] - lag, rec.t, path, nan, nan) for lag in [0.0, *lags])
+    places = np.stack([fixes[there], *later])
+    moved = places[:, LEAST_COUNT:] - places[:, :-LEAST_COUNT]
     off = abs(moved[0] - moved[1:])
     misses = np.where(np.isfinite(off).sum(1) > off.shape[1] / 2, pd.DataFrame(off.T).median(), inf)
     now, least, misses = misses[0], misses.min(), misses[1:]
@@ -423,7 +425,7 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
     x = np.where(marks[:, None], c.x, np.where((fits & ~np.isin(rec.ids, late))[:, None], truth.position, nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
-    if c.log.recording.body is None:
+    if not c.in_body:
         stated[1] = noise.world_azimuth_std
     else:
         turned = rec.relative[0, :, 1] - c.log.recording.relative[0, :, 1]

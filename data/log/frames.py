@@ -1,6 +1,6 @@
 """Clock offsets, SI units and the local east-north-up frame of a log's rows; the sensor noise that they state."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,21 @@ from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD
-from ..cells import factors
-from .units import ANGLES, BODY, KINDS, QUATERNION, Rows, Summary, in_group, only, row_of, stated_std
+from ..cells import Factors, factors
+from .units import (
+    ANGLES,
+    BODY,
+    KEYS,
+    KIND_TABLE,
+    QUATERNION,
+    Rows,
+    Summary,
+    in_columns,
+    in_group,
+    only,
+    row_of,
+    stated_std,
+)
 
 if TYPE_CHECKING:
     from .motion import Member, Steps
@@ -95,7 +108,7 @@ def of_clock_face(t: "pd.Series[float]") -> "pd.Series[float]":
     return 3600.0 * (t // 10000) + 60.0 * (t // 100 % 100) + t % 100
 
 
-def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
+def on_one_clock(rows: Rows, clock: Factors) -> Rows:
     """Rows with stamps, in whole microseconds, less the s that each vehicle's clock is ahead; those without a time, of
     places, at the first instant.
 
@@ -140,14 +153,11 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     Raises:
         InputError: positions in metres beside those in degrees without an origin, or degrees that are never complete.
     """
-    kinds = [KINDS[name] for name in rows["kind"]]
-    scale, offset = np.array([(kind.scale, kind.offset) for kind in kinds]).T
-    rows = rows.assign(kind=[kind.name for kind in kinds], value=scale * rows["value"] + offset)
-    rows = rows.assign(
-        value=rows["value"].mask(rows["kind"].isin(ANGLES[:3]), wrap(rows["value"])), std=rows["std"] * abs(scale)
-    )
+    kind, scale, offset = (rows["kind"].map(KIND_TABLE[column]) for column in ("name", "scale", "offset"))
+    value = scale * rows["value"] + offset
+    value = value.mask(kind.isin(ANGLES[:3]), wrap(value))
+    rows = rows.assign(kind=kind, value=value, std=rows["std"] * abs(scale))
     rows = _by_attitude(rows, summary).replace({"kind": {"vz_body": "vz"}})
-    keys = ["t", "vehicle", "kind"]
     none = _nowhere(rows)
     summary.refuse("fixes at zero, which are none", rows[none])
     rows = rows[~none]
@@ -162,8 +172,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
             "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "
             "ignore= leaves out kinds, and topics of a bag.",
         )
-    fixes = rows[geodetic].drop_duplicates(keys).pivot(index=keys[:2], columns="kind", values="value")
-    fixes = fixes.reindex(columns=["latitude", "longitude", "height"])
+    fixes = in_columns(rows, ["latitude", "longitude", "height"]).sort_index(level="t")
     height = fixes["height"]
     for usual in (height.groupby("vehicle").transform("median"), height.median(), origin[2] if origin else 0.0):
         fixes["height"] = fixes["height"].fillna(usual)
@@ -181,7 +190,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
             name,
         )
     enu = pd.DataFrame(metres, fixes.index, [*ENU]).stack()
-    value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(keys).index).to_numpy())
+    value = rows["value"].mask(geodetic, enu.reindex(rows.set_index(KEYS).index).to_numpy())
     lost = geodetic & value.isna()
     summary.refuse("incomplete fixes, without latitude or longitude", rows[lost])
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[~lost], origin
@@ -193,15 +202,14 @@ def _by_attitude(rows: Rows, summary: Summary) -> Rows:
     turns = rows["kind"].isin(QUATERNION)
     if not turns.any():
         return rows
-    index = rows.set_index(["vehicle", "t", "kind"]).index
-    table = rows["value"].set_axis(index)[~index.duplicated()].unstack().reindex(columns=[*BODY, *QUATERNION])
+    table = in_columns(rows, [*BODY, *QUATERNION])
     unit = abs(np.linalg.norm(table[QUATERNION], axis=1) - 1.0) < QUATERNION_ROUNDING
     table.loc[~unit, QUATERNION] = np.nan
     rotation = to_rotation(table[QUATERNION].groupby("vehicle").ffill().to_numpy())
     heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
     table[BODY] = turned((rotation @ table[BODY].to_numpy()[..., None])[..., 0], -heading)
     table.loc[unit, "qw"] = heading[unit]
-    made = table.stack().reindex(index).to_numpy()
+    made = table.stack().reindex(rows.set_index(KEYS).index).to_numpy()
     known = np.isfinite(made)
     summary.refuse("quaternions that lack a component or are not of unit length", rows[turns & ~known])
     for name in rows["vehicle"][turns].unique():
@@ -214,9 +222,8 @@ def _by_attitude(rows: Rows, summary: Summary) -> Rows:
 def _nowhere(rows: Rows) -> Bools:
     """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 where the last fix before, or the next one,
     is too far away for the vehicle's speed."""
-    key, axes = ["vehicle", "t"], ["x", "y", "latitude", "longitude"]
-    fixes = only(rows, *axes).drop_duplicates([*key, "kind"]).pivot(index=key, columns="kind", values="value")
-    fixes = fixes.reindex(columns=axes).reset_index()
+    axes = ["x", "y", "latitude", "longitude"]
+    fixes = in_columns(rows, axes).reset_index()
     at_zero, no_degrees = (fixes[names].eq(0.0).all(axis=1) for names in (axes[:2], axes[2:]))
     vehicle = fixes["vehicle"]
 
@@ -230,8 +237,8 @@ def _nowhere(rows: Rows) -> Bools:
     leap = at_zero != at_zero.groupby(vehicle).shift(fill_value=False)
     far = leap & (pace(fixes) > most)
     away = (far | far.shift(-1, fill_value=False)).groupby(leap.cumsum()).transform("any")
-    none = fixes.set_index(key).index[no_degrees | (at_zero & away)]
-    return rows.set_index(key).index.isin(none) & in_group(rows, "fix")
+    none = fixes.set_index(KEYS[:2]).index[no_degrees | (at_zero & away)]
+    return rows.set_index(KEYS[:2]).index.isin(none) & in_group(rows, "fix")
 
 
 def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: float) -> Sensors:

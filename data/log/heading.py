@@ -36,6 +36,16 @@ class Signal(NamedTuple):
     t: Floats
     value: Floats
 
+    @property
+    def size(self) -> int:
+        """Of samples."""
+        return len(self.t)
+
+    @property
+    def interval(self) -> float:
+        """s, median time from one sample to the next, 0 where there are not two."""
+        return float(np.median(np.diff(self.t))) if self.size > 1 else 0.0
+
 
 def unknown(at: Floats) -> Floats:
     """(G,) headings of what has none: NaN."""
@@ -84,13 +94,13 @@ class Reckoning(NamedTuple):
     def parts(self, gap: float) -> "Iterator[Reckoning]":
         """Between gaps of the yaw rate, which nothing leads across."""
         gaps = np.flatnonzero(np.diff(self.yaw_rate.t) > gap + SAME_INSTANT) + 1
-        for t in np.split(self.yaw_rate.t, gaps) if len(self.yaw_rate.t) > 1 else ():
+        for t in np.split(self.yaw_rate.t, gaps) if self.yaw_rate.size > 1 else ():
             fixes, speed, rate = (
                 Signal(signal.t[inside], signal.value[inside])
                 for signal in (self.fixes, self.speed, self.yaw_rate)
                 for inside in [(signal.t >= t[0] - 0.5 * gap) & (signal.t <= t[-1] + 0.5 * gap)]
             )
-            if min(len(fixes.t), len(speed.t), len(rate.t)) > 1:
+            if min(fixes.size, speed.size, rate.size) > 1:
                 yield self._replace(fixes=fixes, speed=speed, yaw_rate=rate)
 
 
@@ -104,16 +114,16 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     >>> heading(np.array([0.5, 9.0])).round(3).tolist()
     [3.092, nan]
     """
-    if not len(heading.t):
+    if not heading.size:
         return unknown
     offset = np.unwrap(heading.value[:, 0] - _angle(yaw_rate, heading.t))
     sampled = heading.t if yaw_rate is None else yaw_rate.t
+    return while_sampled(lambda at: wrap(np.interp(at, heading.t, offset) + _angle(yaw_rate, at)), sampled, gap)
 
-    def at(times: Floats) -> Floats:
-        angle = wrap(np.interp(times, heading.t, offset) + _angle(yaw_rate, times))
-        return np.where(covered(sampled, times, gap, gap / 2), angle, nan)
 
-    return at
+def while_sampled(heading: HeadingAt, t: Floats, gap: float) -> HeadingAt:
+    """The same heading, NaN in gaps of the samples at t (M,) s that are longer than `gap` s."""
+    return lambda at: np.where(covered(t, at, gap, gap / 2), heading(at), nan)
 
 
 def heading_until(heading: Signal, yaw_rate: Signal | None) -> HeadingAt:
@@ -152,15 +162,11 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
     known, rate = np.isfinite(heading), way.yaw_rate
     if not known.any():
         return None, factor
-    last = heading_until(Signal(t, heading[:, None]), rate)
-
-    def at(times: Floats) -> Floats:
-        return np.where(covered(rate.t, times, gap, gap / 2), last(times), nan)
-
-    noise, square = way.std**2 * float(np.median(np.diff(way.fixes.t))), Signal(t, variance[:, None])
+    at = while_sampled(heading_until(Signal(t, heading[:, None]), rate), rate.t, gap)
+    noise, square = way.std**2 * way.fixes.interval, Signal(t, variance)
 
     def of_pace(times: Floats) -> Floats:
-        rise: Floats = np.nan_to_num(4.0 * noise * held(square, times)[:, 0] ** 2) ** (1 / 3)
+        rise: Floats = np.nan_to_num(4.0 * noise * held(square, times) ** 2) ** (1 / 3)
         return rise
 
     return Course(at, "fixes", of_pace=of_pace, unsure=float(np.sqrt(np.median(variance[known])))), factor
@@ -172,7 +178,7 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     squared innovations over their variances, with the yaw rates by each factor of OTHERWISE."""
     fixes, speed, rate, std, walk = way
     span = max(float(rate.t[-1] - fixes.t[0]), FILTER_STEP)
-    dt = max(FILTER_STEP, span / min(PER_SAMPLE * len(rate.t), MOST_STEPS))
+    dt = max(FILTER_STEP, span / min(PER_SAMPLE * rate.size, MOST_STEPS))
     t = np.arange(fixes.t[0], fixes.t[0] + span + dt, dt)
     sensors = Sensors(
         gnss_std=(std, std, PLANE_STD),
@@ -201,14 +207,14 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     return t, np.where(known, heading, nan), variance, sums[:, -1].reshape(len(OTHERWISE), -1).min(1)
 
 
-def held(signal: Signal, at: Floats) -> Floats:
-    """(G, C) the last sample at or before each time (G,) s, NaN before the first.
+def held(signal: Signal, at: Floats, otherwise: float = nan) -> Floats:
+    """(G, ...) the last sample at or before each time (G,) s, NaN, or what else is given, before the first.
 
     >>> held(Signal(np.array([0.0, 1]), np.array([[5.0], [6]])), np.array([-1.0, 0, 0.9, 1])).ravel().tolist()
     [nan, 5.0, 5.0, 6.0]
     """
     last = np.searchsorted(signal.t, at + SAME_INSTANT, side="right") - 1
-    return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], nan)
+    return np.where(last >= 0, signal.value.T[..., last], otherwise).T
 
 
 def between(signal: Signal, at: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """Association of relative measurements and messages of a log with steps and pairs: the links of a Recording."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from coopoc.arrays import Bools, Floats, Ints, last_true, runs_in_memory
 from coopoc.world.links import spherical, wrap
 from coopoc.world.sensing import schedule
 
-from .motion import COURSE, Member, Steps, stacked
+from .motion import COURSE, Members, Steps, stacked
 from .units import Rows, Summary, in_group, only, stated_std
 
 COMPONENTS = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
@@ -25,7 +25,7 @@ RADAR = "{} ranges beside a direction count for who measured them alone: a radar
 TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both ends (else mutual=False)"
 
 
-def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool) -> tuple[Links, Floats, Bools, Ints]:
+def linked(rows: Rows, members: Members, steps: Steps, mutual: bool) -> tuple[Links, Floats, Bools, Ints]:
     """Links of all relative measurements and messages.
 
     A bearing becomes an azimuth by the heading of its observer at its own time; in body frames an azimuth becomes a
@@ -44,7 +44,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     summary, sent = steps.summary, only(rows, "message")
     measured = _measured(rows, members, there, steps)
     if mutual:
-        stands = np.array([member.stands for member in members.values()])
+        stands = stacked(members, "stands")
         far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
         aimed = measured[measured["component"] == 1]
         reached = far.set_index(LINK_COLUMNS).index.isin(aimed.set_index(LINK_COLUMNS).index)
@@ -130,7 +130,7 @@ def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:
     return pd.Index(list(ids)).get_indexer(pd.Index(names))
 
 
-def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> DataFrame:
+def _measured(rows: Rows, members: Members, there: Bools, steps: Steps) -> DataFrame:
     """One of each step, observer, neighbour (columns of members) and component of a link, with its value: range m,
     azimuth (in body frames bearing) rad or inclination rad."""
     std, rows = stated_std(rows, "x", "y"), rows[in_group(rows, "relative")]
@@ -197,7 +197,7 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     return table.groupby(LINK_COLUMNS)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
-def _to_step(table: DataFrame, members: Mapping[str, Member], steps: Steps, std: float) -> tuple[Floats, Bools, Bools]:
+def _to_step(table: DataFrame, members: Members, steps: Steps, std: float) -> tuple[Floats, Bools, Bools]:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
     their velocities in the world; and which are vague: g is no longer than `std` m and no more than NEAR_MOTIONS times
@@ -228,7 +228,7 @@ def _to_step(table: DataFrame, members: Mapping[str, Member], steps: Steps, std:
         seen = np.array(far * np.exp(1j * aside))
         there = seen + lag * (during(stacked(members, "velocity"), observer)[:, :2] @ [1, 1j])
         less = np.column_stack([abs(there) - abs(seen), np.angle(there * seen.conj()), 0.0 * lag])
-        stands = np.array([member.stands for member in members.values()])[neighbour] & np.isnan(change[:, 0])
+        stands = stacked(members, "stands")[neighbour] & np.isnan(change[:, 0])
         change = np.where(stands[:, None], less, change)
         value = np.where(component == 1, value + lag * during(rate, observer), value)
     distance = np.where(component == 0, value, np.inf)

@@ -9,7 +9,7 @@ from numpy import inf, nan
 from numpy.linalg import norm
 
 from coopoc import InputError, Sensors
-from coopoc.arrays import Bools, Floats, Ints, checked, last_true
+from coopoc.arrays import AnyArray, Bools, Floats, Ints, checked, last_true
 from coopoc.kernels.constant_velocity import BANK, REMEMBERS, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
@@ -23,6 +23,7 @@ from .heading import (
     heading_at,
     heading_of_rates,
     heading_until,
+    held,
     step_means,
     unknown,
 )
@@ -136,9 +137,14 @@ class Member(NamedTuple):
     climbs: float = 0.0
 
 
-def stacked(members: Mapping[str, Member], field: str) -> Floats:
-    """(T, N, ...) a field of all members."""
-    return np.stack([getattr(member, field) for member in members.values()], axis=1)
+Members = Mapping[str, Member]
+"""By name."""
+
+
+def stacked(members: Members, field: str) -> AnyArray:
+    """(T, N, ...) a field of all members; (N,) of what is one for all times."""
+    each = [getattr(member, field) for member in members.values()]
+    return np.stack(each, axis=min(np.ndim(each[0]), 1))
 
 
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
@@ -185,7 +191,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     grid, summary, body = steps.grid, steps.summary, steps.body
     flat = steps.planar or not rows["kind"].eq("z").any()
     fixes = samples(rows, ("x", "y", "z"), summary, 2 if flat else 3)
-    if not len(fixes.t) and len(parts := only(rows, "x", "y")):
+    if not fixes.size and len(parts := only(rows, "x", "y")):
         raise InputError(
             f"{row_of(parts)}, fixes of {name}",
             "never x, y (and z) at one time",
@@ -201,13 +207,13 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     speed = Signal(speed.t, np.nan_to_num(speed.value))
     still = np.zeros((len(grid), 3))
     none = np.full(len(grid), nan)
-    if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
+    if fixes.size and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = Course(unknown if body else heading_at(measured, None, inf))
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still, still[:, 0])
     std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
-    gyro = float(only(rows, "yaw_rate")["std"].median() * np.median(np.diff(turn.t)) ** 0.5) if len(turn.t) > 1 else 0.0
+    gyro = float(only(rows, "yaw_rate")["std"].median() * turn.interval**0.5)
     if gyro > 0.0:
         way = way._replace(walk=gyro)
     shown, (derived, factor) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))
@@ -232,7 +238,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         summary.assume(f"{OTHER_RATES}{summary.scale(name, factor, 'yaw_rate')} mends it", name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
-            if not len(signal.t):
+            if not signal.size:
                 raise InputError(
                     f"vehicle {name}",
                     f"no {kind}",
@@ -264,17 +270,17 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
         there &= fixed
     text = (
-        f"{len(fixes.t)} fixes, {len(signals[0].t) * (not by_fixes)} samples of odometry, {len(measured.t)} headings, "
+        f"{fixes.size} fixes, {signals[0].size * (not by_fixes)} samples of odometry, {measured.size} headings, "
         f"{'throughout' if there.all() else f'{there.mean():.0%} of the time{_longest(there, grid)}'}"
     )
     absent, compass = np.where(there, 0.0, nan), none
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or len(turn.t) < 2))
+    summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or turn.size < 2))
     wander = _wander(heading, moves, steps)
     if by_fixes:  # at first a velocity is less certain than later, all the way to the next fix
-        wander = np.maximum(wander, np.ptp(fixes.t) / len(fixes.t) * _before(Signal(fixes.t, shown.std), steps) ** 2)
+        wander = np.maximum(wander, np.ptp(fixes.t) / fixes.size * _before(Signal(fixes.t, shown.std), steps) ** 2)
     climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
@@ -291,7 +297,7 @@ def climbing(fixes: Signal) -> float:
     [0.0, 0.17]
     """
     t, z, wander = fixes.t, fixes.value[:, 2], 0.0
-    least = max(1.0, 0.5 * float(np.median(np.diff(t)))) if len(t) > 1 else 1.0
+    least = max(1.0, 0.5 * fixes.interval)
     for times in CLIMBS:
         later = np.searchsorted(t, t + times * least)
         now = np.flatnonzero(later < len(t))
@@ -317,7 +323,7 @@ def _in_world(
         summary.refuse("speeds where a world velocity is given", speeds)
         moved = step_means(Signal(world.t, np.nan_to_num(world.value)), steps.grid)
         return moved, world, heading._replace(wanders=0.0, of_pace=np.zeros_like)
-    if len(speed.t) and (heading.at is not unknown or norm(speed.value.mean(0)) < STANDS):
+    if speed.size and (heading.at is not unknown or norm(speed.value.mean(0)) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
@@ -334,14 +340,14 @@ def _in_world(
         means = step_means(Signal(at[kept], velocity[kept]), steps.grid) + 0.0 * moving(steps.grid + 0.5 * steps.dt)
         beside = [steps.offset.get(f"{name}.{axis}", steps.offset.get(axis, 0.0)) for axis in VELOCITIES[:2]]
         return means - [*beside, 0.0], Signal(at[own & kept], at), heading
-    if len(speed.t):
+    if speed.size:
         raise InputError(
             f"{row_of(speeds)}, speed",
             f"of {name}, which has no heading",
             "needs heading, compass_deg, or fixes of a moving vehicle",
             "Add one, or give vx and vy.",
         )
-    if len(way.fixes.t) < 2:
+    if way.fixes.size < 2:
         raise InputError(
             f"vehicle {name}",
             "no odometry, and less than two fixes",
@@ -358,8 +364,8 @@ def _heading(
 ) -> Course:
     """Heading that was measured, else by the yaw rate and fixes, else the course of the velocities in the world that
     were measured, else of those that fixes have shown."""
-    rate = way.yaw_rate if len(way.yaw_rate.t) > 1 else None
-    if len(measured.t):
+    rate = way.yaw_rate if way.yaw_rate.size > 1 else None
+    if measured.size:
         return Course(heading_at(measured, rate, steps.gap(measured.t)))
     if derived is not None:
         return derived
@@ -369,10 +375,10 @@ def _heading(
         sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
     for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
-        fastest = abs(way.speed.value).max() if len(way.speed.t) else inf
+        fastest = abs(way.speed.value).max() if way.speed.size else inf
         if (moving := (pace > np.maximum(min(MOVING, OF_FASTEST * fastest), SHOWN_STDS * unsure)) & certain).any():
             t, course = velocity.t[moving], np.arctan2(*velocity.value[moving, 1::-1].T)
-            if len(way.speed.t):
+            if way.speed.size:
                 course = wrap(course - np.arctan2(*between(way.speed, t)[:, 1::-1].T))
             bends = norm(wrap(np.diff(course))) / (norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
@@ -427,8 +433,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
 
 def _before(signal: Signal, steps: Steps) -> Floats:
     """(T, ...) last sample before each step, 0 where there is none."""
-    last = np.searchsorted(signal.t, steps.grid - 0.5 * steps.dt - SAME_INSTANT) - 1
-    return np.where(last >= 0, signal.value.T[..., last], 0.0).T
+    return held(signal, steps.grid - 0.5 * steps.dt - 2.0 * SAME_INSTANT, 0.0)
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
@@ -443,8 +448,7 @@ def _present(signals: Sequence[Signal], steps: Steps) -> Bools:
     """(T,) whether all signals are there, or bridged."""
     there = np.ones(len(steps.grid), bool)
     for signal in signals:
-        interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
-        there &= covered(signal.t, steps.grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
+        there &= covered(signal.t, steps.grid, steps.gap(signal.t), max(steps.dt, 0.6 * signal.interval))
     return there
 
 

@@ -12,7 +12,7 @@ from numpy import nan
 from scipy.interpolate import Akima1DInterpolator
 
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
-from coopoc.arrays import Floats, instance, named, number, one_of, texts
+from coopoc.arrays import Floats, instance, named, one_of, texts
 from coopoc.paths import given_path
 from coopoc.text import short_repr
 from coopoc.workers import progress_bar
@@ -23,6 +23,7 @@ from coopoc.world.recording import NOTHING_SIMULATED
 from ..assemble import (
     SAME_INSTANT,
     backward_difference,
+    check_intervals,
     check_scale,
     check_size,
     check_time,
@@ -31,7 +32,7 @@ from ..assemble import (
     longest_gap,
 )
 from ..bag import read_bag
-from ..cells import TABLES, factors, headers
+from ..cells import TABLES, Factors, Names, factors, headers
 from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
 from ..librsf import is_librsf, read_librsf
@@ -40,9 +41,10 @@ from ..nmea import DAY_S, read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
-from .motion import Member, Steps, member, samples, stacked
+from .motion import Members, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
 from .units import (
+    KIND_TABLE,
     KINDS,
     QUATERNION,
     Rows,
@@ -59,6 +61,8 @@ from .units import (
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
+Arms = Mapping[str, Sequence[float]] | Sequence[float]
+"""m forward, left, up, of each vehicle by name, or of all."""
 LOST = 0.02
 """Largest share of the fixes that may fall on a step that already has one, and are lost."""
 SHORTEST_STEP, LONGEST_STEP, PAIR_COLUMNS = 0.02, 1.0, ("vehicle", "partner")
@@ -115,7 +119,7 @@ class Log:
         )
 
 
-def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
+def is_log(path: Path, columns: Names | None = None) -> bool:
     """Whether a path is a log: a bag, NMEA, libRSF's text, tensors of NCLT, a segment of comma2k19, a folder of such
     files, or a table with a column of a log.
 
@@ -136,16 +140,16 @@ def read_log(
     *,
     dt: float | None = None,
     max_gap: float | None = None,
-    columns: Mapping[str, str] | None = None,
-    kinds: Mapping[str, str] | None = None,
+    columns: Names | None = None,
+    kinds: Names | None = None,
     ignore: Sequence[str] = (),
-    scale: Mapping[str, float] | None = None,
-    offset: Mapping[str, float] | None = None,
-    std: Mapping[str, float] | None = None,
+    scale: Factors | None = None,
+    offset: Factors | None = None,
+    std: Factors | None = None,
     stamps: Stamps = "header",
-    clock: Mapping[str, float] | None = None,
-    antenna: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
-    tag: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
+    clock: Factors | None = None,
+    antenna: Arms | None = None,
+    tag: Arms | None = None,
     origin: Origin | None = None,
     truth: str | Path | None = None,
     sensors: Sensors | None = None,
@@ -207,9 +211,7 @@ def read_log(
     texts("ignore", ignore)
     instance("any_scale", any_scale, bool, "Give True or False.")
     instance("mutual", mutual, bool, "Give True or False.")
-    for field, value in {"dt": dt, "max_gap": max_gap}.items():
-        if value is not None:
-            number(field, value, 1e-12, allowed="a number > 0 s", hint="Give seconds.")
+    check_intervals(dt=dt, max_gap=max_gap)
     if origin is not None:
         check_origin(origin)
     options = {
@@ -219,20 +221,18 @@ def read_log(
         "stamps": stamps,
     }
     rows = _rows(path, truth, summary, options)
-    own, ends = rows["vehicle"] + "." + rows["kind"], (rows["vehicle"], rows["partner"])
-    logged, names = rows["kind"].unique(), {*rows["kind"], *own}
-    quantity = rows["kind"].map({kind: KINDS[kind].name for kind in KINDS})
-    of_one = rows["vehicle"] + "." + quantity
+    vehicle, partner, kind = (rows[name] for name in ("vehicle", "partner", "kind"))
+    own, quantity = vehicle + "." + kind, kind.map(KIND_TABLE["name"])
+    of_one, names = vehicle + "." + quantity, {*kind, *own}
     factor = factors(scale, sorted({"t", *names, *quantity, *of_one}))
     by_kind = pd.Series(1.0, rows.index)
-    for kinds_of, like in ((rows["kind"], quantity), (own, of_one)):
-        for key in (like.mask(like.isin(kinds_of)), kinds_of):
+    for logged, like in ((kind, quantity), (own, of_one)):
+        for key in (like.mask(like.isin(logged)), logged):
             by_kind = key.map(factor).fillna(by_kind)
-    key = rows["kind"].mask(own.isin(offset), own)
-    for one, other in (ends, ends[::-1]):
-        pair = one + "-" + other
-        key = key.mask((rows["kind"] == "range") & pair.isin(offset), pair)
-    names |= {*key, "vx", "vy", *(ends[0] + ".vx"), *(ends[0] + ".vy")}
+    key = kind.mask(own.isin(offset), own)
+    for pair in (vehicle + "-" + partner, partner + "-" + vehicle):
+        key = key.mask((kind == "range") & pair.isin(offset), pair)
+    names |= {*key, "vx", "vy", *(vehicle + ".vx"), *(vehicle + ".vy")}
     less = key.map(factors(offset, sorted(names), "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
@@ -244,16 +244,17 @@ def read_log(
     check_one_drive(rows, path.name)
     if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
-    summary.rows = int((rows["true"] == 0).sum())
+    measured = rows["true"] == 0
+    summary.rows = int(measured.sum())
     summary.logged = rows.groupby("vehicle")["kind"].unique().to_dict()
-    rows, true_rows = not_vague(rows[rows["true"] == 0], summary), rows[rows["true"] == 1]
+    rows, true_rows = not_vague(rows[measured], summary), rows[~measured]
     rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
     spans = only(rows, "x").groupby(["vehicle", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
     for name, span in spans.groupby("vehicle"):
         if (span["min"] < span["max"].cummax().shift()).any():
             summary.assume(SEVERAL, f"{name} ({', '.join(sorted(span['file']))})")
-    deviations = factors(std, sorted({*logged, *rows["kind"]} - {"message"}), "std")
-    stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
+    deviations = factors(std, sorted({*kind, *rows["kind"]} - {"message"}), "std")
+    stated = {ENU.get(name, KINDS[name].name): abs(KINDS[name].scale) * each for name, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
     paths = [samples(group, ("x", "y", "z"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
     if not any_scale and any(len(t) for t, _ in paths):
@@ -288,12 +289,11 @@ def read_log(
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
 
-def _recording(
-    rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool, sensors: Sensors | None
-) -> Recording:
+def _recording(rows: Rows, members: Members, steps: Steps, mutual: bool, sensors: Sensors | None) -> Recording:
     """One run of what vehicles, and landmarks in body frames, have measured on steps."""
     ids, body, summary = tuple(members), steps.body, steps.summary
-    marks = [k for k, name in enumerate(ids) if body and members[name].stands]
+    stands = stacked(members, "stands")
+    marks = np.flatnonzero(stands & body).tolist()
     rows = of_vehicles(rows, [ids[k] for k in marks], summary)
     links, relative, broadcasts, arrival = linked(rows, members, steps, mutual)
     to_landmark = np.isin(links.neighbour, marks)
@@ -302,7 +302,7 @@ def _recording(
     gnss, velocity, yaw_rate, compass = (stacked(members, name)[None] for name in names)
     factor = np.empty(0) if body or sensors else fix_factors(rows, ids, steps)
     wander = stacked(members, "wander")
-    least = float(wander[:, [not member.stands for member in members.values()]].min(initial=wander.max()))
+    least = float(wander[:, ~stands].min(initial=wander.max()))
     uncertain = (wander - least).clip(0.0) if wander.max() > least and not sensors else np.empty(0)
     sensors = sensors or assumed(rows, steps, [*members.values()], least)
     return Recording(
@@ -358,8 +358,9 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
         strange = sorted(file.name for file in path.glob("[!.]*") if file.is_file() and not _is_read(file))
         summary.refuse("files of kinds that are not read", len(strange), ", ".join(strange))
-        true_files = true_files or [f for f in files if TRUTH_NAME.fullmatch(f.stem) and f != path]
-        files = [f for f in files if f not in true_files and (not TRUTH_NAME.fullmatch(f.stem) or f == path)]
+        true_by_name = [f for f in files if TRUTH_NAME.fullmatch(f.stem) and f != path]
+        true_files = true_files or true_by_name
+        files = [f for f in files if f not in (*true_files, *true_by_name)]
         if not files:
             raise InputError(
                 "path", str(path), f"must hold files in {', '.join(READERS)}", "Point at the folder of the log."
@@ -437,11 +438,12 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
 
     moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR_COLUMNS)
     t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
-    span = t.max() - t.min()
+    begin = float(t.min())
+    span = t.max() - begin
     if not span:
         raise InputError(
             f"{summary.name}: t",
-            f"{t.min():.10g} s throughout",
+            f"{begin:.10g} s throughout",
             "must hold two instants or more",
             "Is the file complete?",
         )
@@ -465,7 +467,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
-            steps = at.assign(t=((at["t"] - t.min() + SAME_INSTANT) / step).round())
+            steps = at.assign(t=((at["t"] - begin + SAME_INSTANT) / step).round())
             return max(float(steps.duplicated(["vehicle", "t"]).mean()), LOST)
 
         parts = min((1, 2, 3, 4, 5), key=lambda n: lost(step / n))
@@ -475,7 +477,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     check_size(span / step + 1.5, rows["vehicle"].nunique(), len(rows), step, summary.name)
     if span / step < 0.5:
         raise InputError("dt", f"{step:g} s", f"must be well below the {span:g} s of the log", "Take a shorter dt.")
-    return float(t.min()) + step * np.arange(int(span / step + 1.5))
+    return begin + step * np.arange(int(span / step + 1.5))
 
 
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, summary: Summary) -> Fleet:
@@ -507,18 +509,20 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             (3, heading.t, np.unwrap(heading.value, axis=0)),
         ):
             out = poses[:, column, first : first + 3]
+            since, grid = t - steps[0], steps - steps[0]
             if len(t) > 1:
-                out[:] = interpolate(t - steps[0], value, steps - steps[0], longest_gap(t, recording.dt, max_gap))
+                out[:] = interpolate(since, value, grid, longest_gap(t, recording.dt, max_gap))
                 if np.median(np.diff(t)) > SPARSE_SECONDS and len(t) > 2:
                     summary.assume(
                         f"a low-rate truth counts within {SPARSE_SECONDS:g} s of its samples, by Akima's interpolation"
                     )
                     near = covered(t, steps, 0.0, SPARSE_SECONDS)[:, None] & np.isfinite(out)
-                    out[:] = np.where(near, Akima1DInterpolator(t - steps[0], value)(steps - steps[0]), nan)
+                    out[:] = np.where(near, Akima1DInterpolator(since, value)(grid), nan)
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
-    if not np.isfinite(position).any():
+    there = np.isfinite(position[..., 0])
+    if not there.any():
         raise InputError(
             f"{file}: column t",
             f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s",
@@ -526,8 +530,8 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             "Does its clock or its date differ?",
         )
     if axes == 2:
-        position[..., 2] = heights.fillna(0.0).where(np.isfinite(position[..., 0]))
-    there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
+        position[..., 2] = heights.fillna(0.0).where(there)
+    there = np.pad(there, ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = nan
     velocity = backward_difference(steps, position, ids, file)
     turned = wrap(angle) if np.isfinite(angle).any() else None

@@ -165,7 +165,7 @@ def of_measurements(c: Check) -> Iterator[str]:
         name, unit, number, median, std, least, should, noise, outliers = row.values()
         if number < LEAST_COUNT:
             continue
-        word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
+        word = "bearing" if name == "azimuth" and c.in_body else name
         hint = HINTS[name]
         position = max(should**2 - least**2, 0.0) ** 0.5
         wrong = std > WIDE_RATIO * max(should, noise) or (name == "azimuth" and std > MAX_ANGLE_STD > 3 * position)

@@ -19,6 +19,8 @@ from .read import Log
 
 TRUE_POSE_STD = (0.05, 0.05, 0.01, 0.05)
 """m and rad, of first poses that the truth gives."""
+Row = Mapping[str, Any]
+"""Column of a table of results -> what stands there."""
 GATE_STDS = 5.0
 """Standard deviations of an innovation beyond which pose filters of real measurements leave one out."""
 WILD_STDS, LEAST_NIS = 5.0, 0.04
@@ -71,14 +73,19 @@ class Check:
     ranges: tuple[tuple[float, float], ...] = ()
     places: Mapping[str, tuple[complex, float]] = field(default_factory=dict)
     failing: Mapping[str, str] = field(default_factory=dict)
-    vehicles: Sequence[Mapping[str, Any]] = ()
-    measurements: Sequence[Mapping[str, Any]] = ()
+    vehicles: Sequence[Row] = ()
+    measurements: Sequence[Row] = ()
     warnings: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
 
     def shown(self, column: int) -> bool:
         """Whether a velocity is of the fixes, whenever they are."""
         return self.world.sensors.velocity_reading == "fixes" or self.world.ids[column] in self.log.summary.shown
+
+    @property
+    def in_body(self) -> bool:
+        """Whether the log is in body frames."""
+        return self.log.recording.body is not None
 
     @property
     def still(self) -> Bools:

@@ -1,7 +1,7 @@
 """Tables of a log: one row per measurement (long), or one column per kind (wide)."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,18 @@ from pandas import DataFrame
 from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError, suggestion
 
-from ..cells import filled, headers, missing_column, named_columns, numeric, read_frame, seconds, usual_key, words
+from ..cells import (
+    Names,
+    filled,
+    headers,
+    missing_column,
+    named_columns,
+    numeric,
+    read_frame,
+    seconds,
+    usual_key,
+    words,
+)
 from .units import KINDS, Rows, Summary, in_group, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
@@ -20,15 +31,12 @@ UNIT_SUFFIXES = {"m", "cm", "mm", "rad", "deg", "rate", "raw"}
 """Behind the name of a kind, these are no partners."""
 OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
 """Columns of a table of drives."""
-OF_LOGS = (
-    {"kind", "partner", "arrival", *KINDS, *(f"{kind}_std" for kind in KINDS)}
-    - OF_FLEETS
-    - {"speed", "heading", "height"}
-)
+COLUMNS = (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS))
+OF_LOGS = {*COLUMNS} - OF_FLEETS - {"vehicle", "value", "std", "speed", "heading", "height"}
 """Columns that no table of drives has."""
 
 
-def is_log_table(path: Path, columns: Mapping[str, str] | None) -> bool:
+def is_log_table(path: Path, columns: Names | None) -> bool:
     """Whether a table has a column that only a log has, by its header or by our names in `columns`; or one
     without an id that lacks heights or has speeds, as no table of drives does."""
     in_file, ours = {name.lower() for name in headers(path)}, set(columns or ())
@@ -40,8 +48,8 @@ def read_log_table(
     path: Path,
     summary: Summary,
     *,
-    columns: Mapping[str, str],
-    kinds: Mapping[str, str],
+    columns: Names,
+    kinds: Names,
     ignore: Sequence[str],
     **_: Any,
 ) -> Rows:
@@ -62,7 +70,7 @@ def read_log_table(
     frame = read_frame(path, *(columns.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
     frame = _with_whole_stamps(frame, columns)
     beside = {f"{key}_std": f"{name}_std" for key, name in columns.items() if key in KINDS and f"{name}_std" in frame}
-    frame = named_columns(frame, {**beside, **columns}, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
+    frame = named_columns(frame, {**beside, **columns}, COLUMNS, (), file)
     if "t" not in frame:
         placed = {"x", "y"} <= {*frame} or {"latitude", "longitude"} <= {*frame}
         if not (placed and "vehicle" in frame and frame["vehicle"].is_unique):
@@ -79,7 +87,7 @@ def read_log_table(
     return rows
 
 
-def _with_whole_stamps(frame: DataFrame, columns: Mapping[str, str]) -> DataFrame:
+def _with_whole_stamps(frame: DataFrame, columns: Names) -> DataFrame:
     """The frame with stamps of whole seconds and nanoseconds beside them, as of ROS, in one column: t, if none is."""
     numbers = frame.select_dtypes("number")
     for name in numbers:
@@ -90,12 +98,12 @@ def _with_whole_stamps(frame: DataFrame, columns: Mapping[str, str]) -> DataFram
     return frame
 
 
-def _long(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> DataFrame:
-    frame = frame.assign(kind=words(frame, "kind", file))
-    left = frame["kind"].isin(ignore)
-    summary.unused.update("kind " + frame["kind"][left] + ", as ignore= asks")
-    frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
-    strange = frame["kind"][~frame["kind"].isin(KINDS)]
+def _long(frame: DataFrame, file: str, summary: Summary, kinds: Names, ignore: Sequence[str]) -> DataFrame:
+    kind = pd.Series(words(frame, "kind", file), frame.index)
+    left = kind.isin(ignore)
+    summary.unused.update("kind " + kind[left] + ", as ignore= asks")
+    kind = kind[~left].replace(dict(kinds))
+    strange = kind[~kind.isin(KINDS)]
     if len(strange):
         first, *others = dict.fromkeys(strange.tolist())
         more = f" Unknown too: {', '.join(map(repr, others))}." if others else ""
@@ -106,16 +114,15 @@ def _long(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str
             f"must be one of {', '.join(KINDS)}",
             f"{suggestion(first, KINDS, '')} {hint}".lstrip(),
         )
-    return _cells(frame, file, "value", "std")
+    return _cells(frame[~left].assign(kind=kind), file, "value", "std")
 
 
-def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> DataFrame:
+def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Names, ignore: Sequence[str]) -> DataFrame:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
-    columns: dict[str, tuple[str, dict[str, str]]]
-    columns = {"arrival" if kind == "message" else kind: (kind, {}) for kind in KINDS}
+    columns = {"arrival" if kind == "message" else kind: (kind, "") for kind in KINDS}
     for name in () if "partner" in frame else map(str, frame.select_dtypes("number")):
         if named := _of_partner(name):
-            columns[name] = named[0], {"partner": named[1]}
+            columns[name] = named
     columns = {name: of for name, of in columns.items() if name in frame and of[0] not in ignore}
     if not columns:
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
@@ -137,9 +144,10 @@ def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Mapping[str, str
     parts = []
     for name, (kind, partner) in columns.items():
         needed = frame.columns.intersection(["t", "vehicle", "partner", name, f"{name}_std"])
-        parts.append(
-            _cells(frame.loc[filled(frame[name]), needed].assign(kind=kind, **partner), file, name, f"{name}_std")
-        )
+        part = frame.loc[filled(frame[name]), needed].assign(kind=kind)
+        if partner:
+            part["partner"] = partner
+        parts.append(_cells(part, file, name, f"{name}_std"))
     return pd.concat(parts)
 
 

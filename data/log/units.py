@@ -1,6 +1,7 @@
 """Kinds of measurements in a log and their units, the table of its rows, and the counts of what became of them."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -40,11 +41,10 @@ KINDS = {
     **{name: Kind("fix", name) for name in ("x", "y", "z", "height")},
     "latitude": Kind("fix", "latitude", 90.0),
     "longitude": Kind("fix", "longitude", 180.0),
-    **{name: Kind("odometry", name, 500.0) for name in ("vx", "vy", "vz", "speed")},
+    "vx_body": Kind("odometry", "speed", 500.0),
+    **{name: Kind("odometry", name, 500.0) for name in ("vx", "vy", "vz", *BODY)},
     "speed_kmh": Kind("odometry", "speed", 1800.0, 1 / 3.6),
     "speed_knots": Kind("odometry", "speed", 972.0, 1.852 / 3.6),
-    "vx_body": Kind("odometry", "speed", 500.0),
-    **{name: Kind("odometry", name, 500.0) for name in BODY[1:]},
     "yaw_rate": Kind("odometry", "yaw_rate", 35.0),
     "heading": Kind("heading", "heading", MAX_ANGLE_RAD),
     **{name: Kind("heading", name, 1.01) for name in QUATERNION},
@@ -60,7 +60,7 @@ the observer's heading, inclination from +z, elevation above the horizon. A unit
 for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "elevation"):
     KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(pi / 2))
-KIND_LIMITS = {name: kind.limit for name, kind in KINDS.items()}
+KIND_TABLE = pd.DataFrame.from_dict(KINDS, "index", columns=Kind._fields)
 LEAST_VALUES = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 MOST_CODES, LEAP_RATIO, LEAST_MEANT = 3, 1.4, 10
 """Codes for "not measured": most different ones of a kind; ratio to the largest plausible value beyond which a value
@@ -76,6 +76,8 @@ UNIT = (
 )
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
+KEYS = ["vehicle", "t", "kind"]
+"""Columns that name a measurement which has no partner."""
 Rows = pd.DataFrame
 """L measurements, a row each, with the columns of BLANK, `file` and `row` (from 1, the header not counted)."""
 MISSING = np.nan
@@ -117,9 +119,15 @@ def only(rows: Rows, *kinds: str) -> Rows:
     return rows[rows["kind"].isin(kinds)]
 
 
+def in_columns(rows: Rows, kinds: Sequence[str]) -> pd.DataFrame:
+    """Values of these kinds, a column each, of every vehicle and time, the first of several."""
+    each = only(rows, *kinds).drop_duplicates(KEYS)
+    return each.pivot(index=KEYS[:2], columns="kind", values="value").reindex(columns=[*kinds])
+
+
 def in_group(rows: Rows, *groups: str) -> Bools:
     """(L,) True for rows whose kinds are of these groups."""
-    return rows["kind"].isin([name for name, kind in KINDS.items() if kind.group in groups]).to_numpy()
+    return rows["kind"].map(KIND_TABLE["group"]).isin(groups).to_numpy()
 
 
 def stated_std(rows: Rows, *kinds: str) -> float:
@@ -138,7 +146,7 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     in several rows, that are far from what can be meant, or to and from which ranges and speeds leap."""
     own = rows[in_group(rows, "fix", "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
-    size, limit = value.abs(), kind.map(KIND_LIMITS)
+    size, limit = value.abs(), kind.map(KIND_TABLE["limit"])
     wrong = (size > limit) | (value < kind.map(LEAST_VALUES)) | ((kind == "range") & (value == 0.0))
     usual = kind.map(size[~wrong].groupby(kind).max())
     near = (size > limit) & (size <= LEAP_RATIO * usual)  # as of an angle in degrees
@@ -182,7 +190,7 @@ def _leaps(ranges: Rows, number: float) -> Bools:
 def check_values(rows: Rows) -> None:
     """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
     kind, value, partner = rows["kind"], rows["value"], rows["partner"]
-    limit = kind.map(KIND_LIMITS)
+    limit = kind.map(KIND_TABLE["limit"])
     alone = in_group(rows, "relative") & (partner == "")
     deviation = "standard deviation of {kind}"
     for wrong, column, actual, allowed, hint in (
