@@ -56,7 +56,7 @@ def constant_velocity(
     for m in range(models):
         store(score, m, (prior, prior * variance, 0.0))
     for j in range(count):
-        fix, dt = vector_at(fixes[j], 0), t[j] - t[j - 1] if j > 0 else inf
+        fix, dt = (fixes[j, 0], fixes[j, 1], fixes[j, 2]), t[j] - t[j - 1] if j > 0 else inf
         if dt > gap:
             for m in range(models):
                 store(p, m, (1.0, 0.0, speed * speed / variance))

@@ -14,7 +14,7 @@ from numba.extending import overload
 
 from ..arrays import Floats, Ints
 from .compiling.compile import as_written, inner, inside
-from .compiling.small import add, apply, choose_each, from_upper, scale, subtract, vector_at
+from .compiling.small import add, apply, choose_each, from_upper, scale, store, subtract, vector_at
 from .compiling.vectors import Batched, Lanes, choose, lane, less, pack, plus
 
 Five: TypeAlias = tuple[float, float, float, float, float]
@@ -29,8 +29,7 @@ def components(relative: Floats, links: Ints) -> Floats:
     for run in range(len(measured)):
         for k in range(len(links)):
             d, azimuth, inclination = relative[run, links[k]]
-            for i, value in enumerate(five(d, azimuth, inclination)):
-                measured[run, k, i] = value
+            store(measured[run, k], 0, five(d, azimuth, inclination))
     return measured
 
 

@@ -20,6 +20,7 @@ from ..compiling.vectors import LANES, less, plus, put, take
 from ..gate import FIX_GATE, GATE, count, gate_fix, inflation
 from ..geometry import Numbers, axes, direction, submatrix
 from ..motion import MotionNoise
+from ..stars.gaussian import three_rows
 
 HEADING = 3
 """Index of the heading in a member's state."""
@@ -141,10 +142,9 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     (k, o, p), (a, b, c, h, e, g), cov, columns = ends, row, poses.cov, poses.columns
     pending, tiles = int(poses.totals[PENDING]), len(poses.x) // LANES
     for tile in range(tiles):
-        x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
+        x, y, z = three_rows(cov, k * tiles + tile, tiles)
         if o >= 0:
-            x, y = x - entries(cov, o, tile, tiles), y - entries(cov, o + 1, tile, tiles)
-            z = z - entries(cov, o + 2, tile, tiles)
+            x, y, z = subtract((x, y, z), three_rows(cov, o * tiles + tile, tiles))
         total = plus(plus(plus(h * entries(cov, k + HEADING, tile, tiles), a, x), b, y), c, z)
         if g != 0.0:
             total = plus(total, g, entries(cov, o + HEADING, tile, tiles))
@@ -209,8 +209,7 @@ def apply_pending_rows(poses: Poses) -> None:
         lower = gains[0, i + 1], gains[1, i + 1], gains[2, i + 1], gains[3, i + 1]
         if inner_product(upper, upper) + inner_product(lower, lower) != 0.0:
             for tile in range(tiles):
-                first, second = entries(columns, 0, tile, tiles), entries(columns, 1, tile, tiles)
-                rows = first, second, entries(columns, 2, tile, tiles), entries(columns, 3, tile, tiles)
+                rows = *three_rows(columns, tile, tiles), entries(columns, 3, tile, tiles)
                 above, below = uint64(i * tiles + tile), uint64((i + 1) * tiles + tile)
                 put(cov, above, less_inner_product(take(cov, above), upper, rows))
                 put(cov, below, less_inner_product(take(cov, below), lower, rows))

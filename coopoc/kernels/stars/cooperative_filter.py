@@ -222,10 +222,10 @@ def gather(
 ) -> None:
     """Fill the ego's row of a step, and those of neighbours, with the newest message of each."""
     ego, dt, first = measurements.ego, measurements.dt, measurements.start[t]
-    u, r = measurements.velocity[run, t, ego], three_of(assumed.fixes, run, t, ego)
+    u, r = three_of(measurements.velocity, run, t, ego), three_of(assumed.fixes, run, t, ego)
     q, own[DT] = three_of(assumed.process, run, t, ego), dt
     store(own, FIX_VARIANCE // 3, times(r, vector_at(white, 0)))
-    store(own, MOTION // 3, scale(vector_at(u, 0), dt))
+    store(own, MOTION // 3, scale(u, dt))
     store(own, MOTION_VARIANCE // 3, q)
     take_fix(measurements.gnss[run, t, ego], own[MOTION:], r[0], own[LAST_FIX:], own)
     for i in range(4):
@@ -239,11 +239,11 @@ def gather(
         rows[i, AGE] = (t - when) * dt if when >= 0 else -1.0
         if when < 0:
             continue
-        u, q = measurements.velocity[run, when, who[i]], three_of(assumed.process, run, when, who[i])
+        u, q = three_of(measurements.velocity, run, when, who[i]), three_of(assumed.process, run, when, who[i])
         fix = three_of(assumed.fixes, run, when, who[i])
         for c in range(9):
             rows[i, SOLO + c] = sent[who[i], run, when, c]
-        store(rows[i], SPEED // 3, vector_at(u, 0))
+        store(rows[i], SPEED // 3, u)
         store(rows[i], STEP // 3, q)
         store(rows[i], TYPICAL // 3, fix)
 
@@ -332,8 +332,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints)
             doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
     ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
     if doubts[ALONE_FOR] > 0.0:
-        for i in range(12):
-            ego[ANSWER + i] = alone.ego[ANSWER + i]
+        copy(alone.ego[ANSWER:BARE], ego[ANSWER:])
 
 
 @inner
@@ -361,9 +360,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints) 
     for i in range(len(rows)):
         if f.slot[vehicles[i]] < 0:
             join(f, model, rows, vehicles[i], i)
-    for k in range(len(who)):
-        for c in range(4):
-            f.member[k, OUT + c] = math.nan
+    f.member[:, OUT:] = math.nan
     add_fix(f, model, own, rows)
     members = locate(f)
     for i in range(members):

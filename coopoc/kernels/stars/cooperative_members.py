@@ -79,8 +79,7 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints) ->
     A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
     """
     who = f.who
-    for k in range(len(who)):
-        who[k, INPUT] = ABSENT
+    who[:, INPUT] = ABSENT
     for i in range(len(rows)):
         if f.slot[vehicles[i]] >= 0:
             who[f.slot[vehicles[i]], INPUT] = i
@@ -190,10 +189,10 @@ def replace_implausible_velocity(
 def stand(f: Filter, rows: Floats, k: int) -> None:
     """Move a member of whose position nothing is known to where the ego measures it, or, where a component is missing,
     somewhere near: its measurement is linear there."""
-    g, row, first = f.g, f.who[k, INPUT], 3 * f.g.block[k, PLACE]
-    near, whole, gap = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row), vector(load(rows[row], 0, FIVE))
-    for c in range(3):
-        g.x[first + c] = g.x[c] + (gap[c] if whole else near * (1.0 if c < 2 else 0.1))
+    g, row = f.g, f.who[k, INPUT]
+    near, gap = 1.0 + max(rows[row, 0], 0.0), vector(load(rows[row], 0, FIVE))
+    gap = gap if measured_whole(rows, row) else (near, near, 0.1 * near)
+    store(g.x, g.block[k, PLACE], add(vector_at(g.x, 0), gap))
 
 
 @part

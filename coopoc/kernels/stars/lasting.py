@@ -22,7 +22,7 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..compiling.small import inner_product, store, subtract, trace, vector_at
+from ..compiling.small import block_at, inner_product, store, subtract, trace, vector_at
 from ..geometry import submatrix
 from .cooperative_state import (
     CLOCK,
@@ -125,7 +125,7 @@ def add_lasting(f: Filter, model: Model, own: Floats) -> None:
     c, error = ego[PRODUCTS] / n, ego[PRODUCTS2] / n * max(2.0 * ERROR_MEMORY_S / seconds, 1.0 / n)
     if model.forget == 0.0:
         return
-    stated = ego[COVARIANCE] + ego[COVARIANCE + 4] + ego[COVARIANCE + 8]
+    stated = trace(block_at(ego, COVARIANCE // 9))
     shown = c - error / c - stated if c > 0.0 and c * c > error else 0.0
     more = max(shown, 3.0 * usual_error(f, ABSENT) / (1.0 + neighbours)) / sum(vector_at(own, FIX_VARIANCE // 3))
     for i in range(3):
