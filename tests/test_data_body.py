@@ -183,7 +183,7 @@ def test_bearings_that_are_called_azimuths_are_named(tmp_path, frame, hint):
 @pytest.mark.parametrize(
     ("kind", "change", "said"),
     [
-        ("yaw_rate", (-1, 0), "fixes of red contradict: scale=red.yaw_rate:-1"),
+        ("yaw_rate", (-1, 0), "fixes of red contradict: scale=red.yaw_rate:-1 mends it, unless x and y"),
         ("yaw_rate", (57.3, 0), "fixes of red contradict: scale=red.yaw_rate:0.01745"),
         ("bearing", (1, 1.5), r"turned by -1\.5\d? rad: add -1\.5"),
     ],

@@ -23,9 +23,9 @@ SURE = 0.15
 """rad, standard deviation of a heading below which it is one."""
 GYRO_BIAS, GYRO_WALK, SCALE = 0.02, 0.01, 0.03
 """rad/s, bias of a yaw rate; rad in a root of a second, by which its integral wanders; share by which a speed errs."""
-OTHERWISE, FITS_BETTER = (1.0, -1.0, pi / 180), 0.5
+OTHERWISE, FITS_BETTER, MOST_SQUARE = (1.0, -1.0, pi / 180), 0.5, 25.0
 """Factors of yaw rates that may have been meant: none, clockwise, degrees; share of the squared innovations of the
-first that another leaves."""
+first that another leaves, each over its variance, which counts as MOST_SQUARE at most."""
 
 HeadingAt = Callable[[Floats], Floats]
 
@@ -152,6 +152,9 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
     >>> course, factor = heading_of_rates(way, 1.0)
     >>> course.at(np.array([50.0])).round(1), factor  # 10 rad
     (array([-2.6]), 1.0)
+    >>> begins_elsewhere = 20 * circle + np.outer(t < 10, [1000, 0])
+    >>> heading_of_rates(way._replace(fixes=Signal(t, begins_elsewhere), speed=Signal(t, 20 * speed)), 1.0)[1]
+    1.0
     """
     per_part = [*map(poses_of, way.parts(gap))]
     if not per_part:
@@ -200,7 +203,8 @@ def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
     spread = std, std, PLANE_STD, pi / FIRST_DIRECTIONS
     track: Any = PoseFilter("solo", begin=begin[:, None], spread=spread)(rec, [0])
     known = 2.0 * std**2 + np.trace(track.covariance[:, :, 0, :2, :2], axis1=2, axis2=3)
-    sums = np.nancumsum(np.square(fix_innovations(track, rec)[:, :, 0]).sum(-1) / known, axis=1)
+    squares = np.square(fix_innovations(track, rec)[:, :, 0]).sum(-1) / known
+    sums = np.nancumsum(squares / (1.0 + squares / MOST_SQUARE), axis=1)  # a receiver may begin km away
     best = sums[:FIRST_DIRECTIONS].argmin(0), np.arange(len(t))
     heading, variance = track.heading[..., 0][best], track.heading_covariance[..., 0, 3][best]
     known = np.maximum.accumulate(variance < SURE**2)

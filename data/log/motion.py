@@ -235,7 +235,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         shown = velocity_of_fixes(way, steps)
         derived, factor = heading_of_rates(way, steps.gap(turn.t))
     if factor != 1.0:
-        summary.assume(f"{OTHER_RATES}{summary.scale(name, factor, 'yaw_rate')} mends it", name)
+        mirrored = ", unless x and y of the fixes are swapped, or one of them has the other sign" * (factor < 0.0)
+        summary.assume(f"{OTHER_RATES}{summary.scale(name, factor, 'yaw_rate')} mends it{mirrored}", name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not signal.size:
