@@ -395,7 +395,15 @@ def test_places_need_no_times(tmp_path):
 
 @pytest.mark.parametrize(
     ("code", "kinds"),
-    [(-1, ["range"]), (0, ["range"]), (9999, ["range"]), (511, ["heading"]), (0, ["x", "y"]), (10**9, ["x", "y"])],
+    [
+        (-1, ["range"]),
+        (0, ["range"]),
+        (9999, ["range"]),
+        (511, ["heading"]),
+        (-1, ["heading"]),
+        (0, ["x", "y"]),
+        (10**9, ["x", "y"]),
+    ],
 )
 def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
     """Every fourth row: the log is that with empty cells; one alone, or a mast at the origin, is what it says."""

@@ -63,8 +63,9 @@ KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float
 KIND_TABLE = pd.DataFrame.from_dict(KINDS, "index", columns=Kind._fields)
 LEAST_VALUES = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
 MOST_CODES, LEAP_RATIO, LEAST_MEANT = 3, 1.4, 10
-"""Codes for "not measured": most different ones of a kind; ratio to the largest plausible value beyond which a value
-is one, and, of a value that is plausible, its least rows and the ratio to a pair's usual step that makes a leap."""
+"""Codes for "not measured": most different ones of a kind, and of a common number in a row; ratio to the largest
+plausible value beyond which a value is one, and, of a value that is plausible, its least rows and the ratio to a
+pair's usual step that makes a leap."""
 VAGUE, NONSENSE = 30.0, 50.0
 """Ratio to the usual standard deviation of a vehicle's kind from which the largest one, if it repeats, means "not
 measured" (the square of it, if it does not), and the least that can, in any unit: fixes may be of 2 cm or 5 m."""
@@ -143,7 +144,7 @@ def row_of(rows: Rows) -> str:
 
 def without_codes(rows: Rows, summary: "Summary") -> Rows:
     """Rows but those whose number says that there was no measurement, as -1, 0 or 65.535 among ranges: one of few, each
-    in several rows, that are far from what can be meant, or to and from which ranges and speeds leap."""
+    in several rows, that are far from what can be meant, or to and from which signals leap."""
     own = rows[in_group(rows, "fix", "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
     size, limit = value.abs(), kind.map(KIND_TABLE["limit"])
@@ -154,13 +155,12 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     codes = own[wrong & ~kind.isin(several.index[several > 1])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= MOST_CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
-    for name in ("range", "speed", "speed_kmh", "z", "height"):
-        values = rows[(rows["kind"] == name) & ~rows.index.isin(lost.index)]
-        values = values.sort_values(["vehicle", "partner", "t"], kind="stable")
-        each = values["value"]  # a car may stand often, and most of what is read stands at one height
-        numbers = [each.min()] if name in ("z", "height") else [*each.mode()[:1]] if name == "range" else []
-        for number in {*numbers, each.max()}:
-            lost = pd.concat([lost, values[_leaps(values, number)]])
+    signals = own[~own.index.isin(lost.index) & ~kind.isin(["x", "y", "latitude", "longitude"])]
+    for name, values in signals.sort_values(["vehicle", "partner", "t"], kind="stable").groupby("kind"):
+        each = values["value"]  # a car may stand often, or go straight ahead: of what is no maximum a few in a row
+        for number in {each.min(), *each.mode()[:1], each.max()}:
+            most = None if name in ("range", "z", "height") or number == each.max() else MOST_CODES
+            lost = pd.concat([lost, values[_leaps(values, number, KINDS[str(name)].limit, most)]])
     for (what, number), same in lost.groupby(["kind", "value"]):
         summary.refuse(f"{what} of {number:g}, which stands for none", same)
     return rows.drop(lost.index.unique())
@@ -177,14 +177,18 @@ def not_vague(rows: Rows, summary: "Summary") -> Rows:
     return rows.drop(vague.index)
 
 
-def _leaps(ranges: Rows, number: float) -> Bools:
-    """(M,) ranges of that number, if there are many, and those of a pair leap there and back; else none."""
-    same, pair = ranges["value"] == number, ranges["vehicle"] + "-" + ranges["partner"]
-    leaps, plain = (
-        ranges["value"][some].groupby(pair).diff().abs()[lambda step: step > 0.0] for some in (same | True, ~same)
-    )
-    leaps = leaps[same | same.shift(fill_value=False)]
-    return (same & bool(same.sum() >= LEAST_MEANT and leaps.median() > LEAST_MEANT * plain.quantile(0.8))).to_numpy()
+def _leaps(values: Rows, number: float, limit: float, most: int | None) -> "pd.Series[bool]":
+    """(M,) values of that number to and from which those of a vehicle or pair leap, if there are many, or all of it if
+    most are; none leaps of more than `most` in a row. Angles, whose `limit` is a turn, leap by half of it at most."""
+    same, pair = values["value"] == number, values["vehicle"] + "-" + values["partner"]
+    others = values["value"].mask(same).groupby(pair)
+    before, behind = others.ffill(limit=most) - number, others.bfill(limit=most) - number
+    steps = pd.concat([others.diff(), before, behind], axis=1, ignore_index=True).abs()
+    steps = steps.where(steps <= limit / 2, abs(limit - steps))
+    usual = steps[0][steps[0] > 0.0].quantile(0.8)
+    leaps = same & (steps[[1, 2]].min(axis=1, skipna=most is None) > LEAST_MEANT * usual)
+    leaps &= ~(before * behind < 0.0)  # as a signal goes through 0
+    return (same if leaps.sum() > 0.5 * same.sum() else leaps) & (leaps.sum() >= LEAST_MEANT)
 
 
 def check_values(rows: Rows) -> None:
