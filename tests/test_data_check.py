@@ -47,6 +47,10 @@ FAULTS: dict[str, tuple[Any, str]] = {
         lambda f: f.assign(x=f["x"] + 15 * f.index.isin(np.flatnonzero(f["x"].notna())[::20])),
         r"car0: [45]\.\d% of the fixes lie beyond 5",
     ),
+    "an offset that lasting errors of fixes may be": (
+        lambda f: f.assign(range=f["range"] + 1.5, x_std=3.0, y_std=3.0),
+        r"^(?:car.: NIS .*\n?){2}$",
+    ),
     "ranges of one end": (
         lambda f: pd.concat(
             [f, f.dropna(subset="range").eval("vehicle = partner\npartner = 'car0'\nrange = range + 1")]

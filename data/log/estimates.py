@@ -51,6 +51,8 @@ CONFIDENT_RATIO = 3.0
 reported."""
 RARE = 1e-6
 """Chance of squared innovations from which they are beyond it."""
+SMALL_NIS = 0.5
+"""Mean NIS below which errors of fixes are correlated in time, or smaller than stated."""
 ERRORS_LAST = 1.5
 """Factor of the standard errors of clocks: errors of two filters may last for most of a short drive."""
 LONG_LAG = 2.0
@@ -139,18 +141,20 @@ def less_means(x: Any, groups: Ints) -> Any:
 def lasting(parts: Floats) -> Floats:
     """Standard error (k,) of a sum of errors in parts (P, k) of a drive, each of which is correlated with the next, as
     of an autoregression of first order; the correlation of few is too small by chance (Kendall, Biometrika 41, 1954).
-    Of less than FEW_PARTS it is larger, as Student's t is, so that SURE_ERRORS of it are as sure.
+    Of parts that are worth less than FEW_PARTS independent ones it is larger, as Student's t is, so that SURE_ERRORS of
+    it are as sure.
 
     >>> wander = np.cumsum(np.random.default_rng(0).normal(size=(40, 1)), axis=0)
-    >>> bool(lasting(wander)[0] > 2.0 * 40**0.5 * wander.std())
+    >>> bool(lasting(wander)[0] > 20.0 * 40**0.5 * wander.std())
     True
     """
     errors, count = parts - parts.mean(0), len(parts)
-    few = np.divide(*scipy.stats.t.isf(SURELY, [min(count, FEW_PARTS) - 1, FEW_PARTS - 1]))
     square = np.square(errors).sum(0)
     next_to = (errors[1:] * errors[:-1]).sum(0) / np.maximum(square, 1e-300)
     correlation = ((count * next_to + 1.0) / (count - 4.0)).clip(0.0, 0.95)
-    error: Floats = few * np.sqrt(square * (1.0 + correlation) / (1.0 - correlation))
+    longer = (1.0 + correlation) / (1.0 - correlation)
+    few = scipy.stats.t.isf(SURELY, (count / longer).clip(2.0, FEW_PARTS) - 1.0)
+    error: Floats = few / scipy.stats.t.isf(SURELY, FEW_PARTS - 1.0) * np.sqrt(square * longer)
     return error
 
 
@@ -358,11 +362,13 @@ def clocks(c: Check, alike: bool, reference: int | None = None) -> tuple[Estimat
 
 
 def share(c: Check) -> float:
-    """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
-    variance = pd.DataFrame(c.variance[..., :2].mean(2)).mean()
-    ratio = variance + np.square(c.world.sensors.fix_std[:2]).mean()
+    """Share of the variance of filters that the mean over the drive keeps: their errors last for some time, and what
+    fixes err by beyond their innovations, where these are small, may be there throughout."""
+    variance, nis = pd.DataFrame(c.variance[..., :2].mean(2)).mean(), pd.DataFrame(c.normalised).mean()
+    ratio = variance + (fixes := np.square(c.world.sensors.fix_std[:2]).mean())
     ratio /= (variance * np.isfinite(c.normalised).sum(0)).clip(1e-12)
-    return min(2.0 * float(ratio.where(variance > 0.0, 0.0).max()), 1.0)
+    share = min(2.0 * float(ratio.where(variance > 0.0, 0.0).max()), 1.0)
+    return max(share, float(((1.0 - nis) * fixes / variance)[nis < SMALL_NIS].max()))
 
 
 def median(values: Floats) -> tuple[float, float]:
