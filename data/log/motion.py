@@ -66,12 +66,14 @@ class Shown(NamedTuple):
         certain: (M,) whether they show it.
         wanders: m^2/s, by which a position that is predicted with the last one becomes uncertain.
         std: (M,) m/s, of the velocity.
+        moved: (M,) m^2, by how much a position has moved otherwise than was predicted with it.
     """
 
     velocity: Signal
     certain: Bools
     wanders: float
     std: Floats
+    moved: Floats
 
 
 class Steps(NamedTuple):
@@ -282,6 +284,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     wander = _wander(heading, moves, steps)
     if by_fixes:  # at first a velocity is less certain than later, all the way to the next fix
         wander = np.maximum(wander, np.ptp(fixes.t) / fixes.size * _before(Signal(fixes.t, shown.std), steps) ** 2)
+        at, _ = steps.nearest(fixes.t)
+        np.maximum.at(wander, at[at >= 0], shown.moved[at >= 0] / steps.dt)
     climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
@@ -373,8 +377,8 @@ def _heading(
     sources = [("fixes", shown)]
     if world is not None:
         none = np.zeros(len(world.t))
-        sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
-    for source, (velocity, certain, wanders, unsure) in sources:
+        sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none, none)))
+    for source, (velocity, certain, wanders, unsure, _) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
         fastest = abs(way.speed.value).max() if way.speed.size else inf
         if (moving := (pace > np.maximum(min(MOVING, OF_FASTEST * fastest), SHOWN_STDS * unsure)) & certain).any():
@@ -416,20 +420,22 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     (t, x), variance = way.fixes, way.std**2
     if len(t) < 2:
         none = np.zeros(len(t))
-        return Shown(Signal(t, np.zeros_like(x)), none > 0, 0.0, none)
+        return Shown(Signal(t, np.zeros_like(x)), none > 0, 0.0, none, none)
     apart = np.diff(t)
     interval = float(np.median(apart))
-    velocity, growth, spread, proved = constant_velocity(
+    velocity, growth, spread, proved, moved = constant_velocity(
         t, x, interval, steps.gap(t) + SAME_INSTANT, variance, UNKNOWN_SPEED, BANK
     )
     sure = np.isfinite(growth)
     since = np.arange(len(growth)) - last_true(~sure)
     begun = since > 1  # two fixes show no change
     learned = begun & (t > t[0] + REMEMBERS)
-    grown = (growth * np.maximum(proved, variance))[learned if learned.any() else begun]
-    wanders = float(grown.mean() / interval) if len(grown) else 0.0
+    grown = np.where(begun, growth * np.maximum(proved, variance), 0.0)
+    known = grown[learned if learned.any() else begun]
+    wanders = float(known.mean() / interval) if len(known) else 0.0
+    moved = np.maximum(grown, np.maximum(moved, np.append(0.0, moved[:-1])))  # the next fix decides
     certain = (since > 3) | (sure & (spread * np.quantile(apart, 0.9) ** 2 < 2.0))
-    return Shown(Signal(t, velocity), certain, wanders, np.sqrt(proved * spread))
+    return Shown(Signal(t, velocity), certain, wanders, np.sqrt(proved * spread), moved)
 
 
 def _before(signal: Signal, steps: Steps) -> Floats:
