@@ -58,6 +58,14 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     assert {name: files(tmp_path / "small")[name] for name in finished} == finished
 
 
+def test_tables_of_other_settings_than_the_last_ones_are_not_shown(study, tmp_path):
+    run_study(study, tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        run_study(replace(study, prepare=lambda cells, jobs: 1 / 0), tmp_path, settings={"max_neighbours": 7})
+    with refused("has tables and figures of other cells"):
+        views(tmp_path / "small")
+
+
 def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study, tmp_path):
     trouble = tmp_path / "trouble"
     trouble.write_text("exit")

@@ -60,13 +60,14 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool) 
                     listed.append({"name": name, "caption": each.save(folder / kind / name), **content})
                 bar.update()
     with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers
-        before = views(folder)
+        before = _stored(folder)
         for kind, listed in shown.items():
             old = {view["name"] for view in before[kind]} - {view["name"] for view in listed}
             for path in (folder / kind).glob("*.*"):
                 if path.stem in old:
                     path.unlink()
     stored = {
+        "cells": [*store.read(folder).cells],
         **shown,
         "findings": made("findings", study.answers) or [],
         "recipe": dict(made("recipe", study.recipe) or {}),
@@ -83,8 +84,17 @@ def views(folder: str | Path) -> Mapping[str, Any]:
     """Read the views of a study: tables and figures by name, findings, recipe, missing views, limitations.
 
     Raises:
-        InputError: the study was not run to its end, the file is damaged, or a view's name is no file name.
+        InputError: the study was not run to its end, or its last run was not, the file is damaged, or a view's name is
+            no file name.
     """
+    stored = _stored(folder)
+    if stored.get("cells") != [*store.read(given_path(folder)).cells]:
+        allowed = "has tables and figures of other cells: a run since then, with other settings, has not ended"
+        raise InputError("folder", str(folder), allowed, "Repeat coopoc run: finished cells are kept.")
+    return stored
+
+
+def _stored(folder: str | Path) -> Mapping[str, Any]:
     path = given_path(folder) / VIEWS
     stored = store.content(path, _FIELDS)
     for view in (*stored["tables"], *stored["figures"]):

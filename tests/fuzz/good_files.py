@@ -93,6 +93,7 @@ MANIFEST = json.dumps(
 _MEAN = {"mean": 1.5, "low": 1.25, "high": 1.75, "n": 4}
 VIEWS = json.dumps(
     {
+        "cells": [CELL],
         "tables": [
             {
                 "name": "rt_le",

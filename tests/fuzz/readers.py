@@ -29,6 +29,7 @@ class Reader(NamedTuple):
 
 
 def _views(folder: Path) -> None:
+    (folder / "manifest.json").write_text(good.MANIFEST)
     for form in FORMATS:
         publish.tables(folder, form)
 
