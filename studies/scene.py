@@ -175,11 +175,6 @@ def heading(p: Params) -> str:
     )
 
 
-def decimals(p: Params) -> int:
-    """Digits of RT-LE in tables: one more where errors are centimetres."""
-    return 3 if is_real(p["data"]) else 2
-
-
 def conditions(p: Params) -> str:
     """Heading and size of a cell, for captions; of real data whose they are."""
     real = measured(p["data"])

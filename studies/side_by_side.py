@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from coopoc.study.numbers import Results, alike, present, ran, rms
+from coopoc.study.numbers import Results, present, ran, rms, sign
 from coopoc.study.style import look
 from coopoc.study.tables import Table, smooths
 
@@ -50,13 +50,16 @@ def _table(text: str, value: str, **options: Any) -> TableView:
     def view(results: Results) -> Table | None:
         if value not in results.frame:
             return None
-        methods = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
+        methods = [*results.with_failed().frame["method"].unique()]  # without those that lack the metric, below
         texts = (text, *([_changed(results)] if _changed(results) else []))
         real = scene.measured(results.settings["data"])
         if real is not None and value in ("rt_le_m", "innovation_m"):
-            texts += (HELD * ("gnss" in methods), f"The log: {'; '.join(real.notes[1:])}.")
+            texts += (
+                HELD * (present(results, {"method": ["gnss"]}, value) is not None),
+                f"The log: {'; '.join(real.notes[1:])}.",
+            )
         rows, where = ("method", "noise_model"), {"method": methods}
-        return table(*texts, value=value, rows=rows, where=where, **{"decimals": 2, **options})(results)
+        return table(*texts, value=value, rows=rows, where=where, **options)(results)
 
     return view
 
@@ -83,9 +86,7 @@ def _findings(results: Results) -> list[str]:
         if ranked:
             (value, (method, model)), *others = ranked
             best = of(method, model, max_neighbours=k)
-            same = [
-                look(m).label for _, (m, n) in others if alike(results, best, of(m, n, max_neighbours=k), "rt_le_m")
-            ]
+            same = [look(m).label for _, (m, n) in others if not sign(results, best, of(m, n, max_neighbours=k))]
             near = f" Noise may explain the difference from {', '.join(dict.fromkeys(same))}." * bool(same)
             gap = f", {value / bound:.2f} times the bound" if bound else ""
             named = f" ({model})" if len({model for _, model in each} - {"bound"}) > 1 else ""

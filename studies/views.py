@@ -50,11 +50,10 @@ def table(
     """
 
     def view(results: "Results") -> Table | None:
-        kept = present(results, where or {}, value)
+        kept = present(results.with_failed(), where or {}, value)
         if kept is None:
             return None
-        shown = {"decimals": scene.decimals(results.settings), **options}
-        made = pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
+        made = pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **options)
         return replace(made, notes=(*made.notes, *unused(results, scene.is_real(results.settings["data"]))))
 
     return view
@@ -81,8 +80,7 @@ def selections(
 
     def view(results: "Results") -> Table | None:
         shown = rows(results) if callable(rows) else rows
-        kept = {"decimals": scene.decimals(results.settings), **options}
-        return crossed(results, head, shown, columns, scene.caption(results, *texts, **(at or {})), **kept)
+        return crossed(results, head, shown, columns, scene.caption(results, *texts, **(at or {})), **options)
 
     return view
 

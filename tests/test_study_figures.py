@@ -168,7 +168,7 @@ def test_every_line_that_coincides_is_named(results):
         replace(results, frame=frame), [Panel({k: {"max_neighbours": k} for k in (0, 2)})], lines, "c"
     )
     first, *_ = plot.figure.axes[0].get_legend().get_texts()
-    assert first.get_text() == "KF\nidentity = FedKalmanNet\nfitted = OKF"
+    assert first.get_text() == "KF\nidentity ≈ FedKalmanNet\nfitted ≈ OKF"
 
 
 def from_reference(file):

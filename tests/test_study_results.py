@@ -85,7 +85,7 @@ def test_an_ego_without_all_its_runs_is_left_out_and_said_so(frame):
     summary = results(gone).summary(["method", "noise_model", "k"], "rt_le_m")
     assert summary.query("method == 'gnss' and k == 0")[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
     table = pivot(results(gone), ["k"], "method", "rt_le_m", where={"noise_model": ["identity"]})
-    assert "1 egos are left out" in table.notes[0]
+    assert "1 egos of GNSS are left out of 1 means" in table.notes[0]
 
 
 def test_a_seed_that_diverged_is_not_averaged_away(frame):

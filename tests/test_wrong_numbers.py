@@ -413,9 +413,9 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table():
     ]
     rows = [{**row, "rt_le_m": 0.5} if row["max_neighbours"] == 0 else row for row in rows]
     results = Results("s", "?", STUDY.axes, STUDY.settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
-    text = "K = 2: equal to solo within 0.001 m: no neighbour's measurement was used, because "
+    text = "K = 2: equal to solo within 0.1%: no neighbour's measurement had an effect, because "
     assert [note.partition(", ")[2] for note in unused(results, False)] == [
-        f"{text}what was measured lacks what it takes, such as an azimuth.",
+        f"{text}what was measured lacks what it takes, such as an azimuth, or says far less than fixes.",
         f"{text}no message arrived.",
     ]
     assert STUDY.answers(results)[-1].startswith("K = 0: ")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from ..arrays import Floats
-from ..evaluate.statistics import Interval, over_seeds, paired_difference
+from ..evaluate.statistics import Interval, mean_interval, over_seeds, paired_difference
 
 if TYPE_CHECKING:
     from . import results
@@ -20,7 +20,8 @@ Number: TypeAlias = Callable[[Results, Where], Any]
 
 
 def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str, Any] | None:
-    """`where` without the values for which nothing was run; None if that leaves no row with a number.
+    """`where` without the values for which nothing was run; None if that leaves no row with a number, or of a failed
+    cell.
 
     Args:
         results: of the study.
@@ -30,7 +31,8 @@ def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str,
     if not {*where, value} <= set(results.frame):
         return None
     lists = {name: wanted if isinstance(wanted, list) else [wanted] for name, wanted in where.items()}
-    rows = results.frame.dropna(subset=[value])[[*lists]].astype(object)
+    rows = results.frame
+    rows = rows[rows[value].notna() | (rows.get("status") == "failed")][[*lists]].astype(object)
     rows = rows.where(rows.notna(), None)
     for name, wanted in lists.items():
         rows = rows[rows[name].isin(wanted)]
@@ -39,14 +41,18 @@ def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str,
 
 def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     """Mean of a metric over egos, runs and training seeds."""
-    kept = present(results, where, value)
-    return None if kept is None else float(results.values(value, kept).mean())
+    return next((float(values.mean()) for values in _values(results, where, value)), None)
 
 
 def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval | None:
     """Mean of a metric over egos, runs and training seeds, with its interval over egos, then runs."""
+    return next(map(mean_interval, _values(results, where, value)), None)
+
+
+def _values(results: Results, where: Where, value: str) -> list[Floats]:
+    """(R, E) of a metric for the egos that have it in all runs; nothing if none has."""
     kept = present(results, where, value)
-    return None if kept is None else results.interval(value, kept)
+    return [] if kept is None else paired(results, value, kept)[0]
 
 
 def rms(results: Results, where: Where) -> float | None:
@@ -73,6 +79,15 @@ def paired(results: Results, value: str, *wheres: Where) -> tuple[list[Floats], 
 def difference(results: Results, method: Where, base: Where) -> Interval | None:
     """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where no pair was run."""
     return next(iter(gaps(results, method, base).values()), None)
+
+
+def failures(results: Results, where: Where) -> Any:
+    """Rows of the failed cells of a selection."""
+    rows = results.failures
+    for name in where.keys() & rows:
+        wanted = where[name]
+        rows = rows[rows[name].isin(wanted if isinstance(wanted, list) else [wanted])]
+    return rows
 
 
 def across(number: Number, selections: Mapping[str, Where]) -> dict[str, Number]:
@@ -168,11 +183,26 @@ def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
     return intervals
 
 
-def alike(results: Results, first: Where, second: Where, value: str) -> bool:
-    """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or there is
-    none, as they share no ego and run."""
-    both = *gaps(results, first, second, value).values(), *gaps(results, second, first, value).values()
-    return not both or any(gap.low <= 0 <= gap.high for gap in both)
+EQUAL_SHARE = 1e-3
+"""Share of a number: a smaller difference is none."""
+
+
+def sign(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> int:
+    """Sign of the difference of two selections, which decides who is better in every table and sentence.
+
+    0 if noise or training can explain it or it is below EQUAL_SHARE: an interval of it is not beyond, or is unknown.
+
+    >>> from pandas import DataFrame
+    >>> from coopoc.study.results import Results
+    >>> frame = DataFrame({"method": [*"aabbccd"], "run": [0, 1] * 3 + [0], "ego": "e"})
+    >>> frame["rt_le_m"] = [1.0, 2.0, 1.1, 2.1, 1.0 + 1e-7, 2.0 + 1e-7, 0.5]  # one draw, d, is no evidence
+    >>> [sign(Results("s", "?", (), {}, frame, frame[:0], 0, {}), {"method": "a"}, {"method": of}) for of in "bcd"]
+    [-1, 0, 0]
+    """
+    there, back = (gaps(results, *both, value).values() for both in ((first, second), (second, first)))
+    ends = np.array([(gap.low, gap.high) for gap in there] + [(-gap.high, -gap.low) for gap in back])
+    least = EQUAL_SHARE * abs(mean(results, second, value) or 0.0)
+    return int((ends > least).all()) - int((ends < -least).all())
 
 
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
@@ -187,8 +217,7 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     intervals = gaps(results, trained, other)
     if not intervals:
         return f"cannot be compared with {name}: they share no ego and run"
-    ends = np.array([(gap.low, gap.high) for gap in intervals.values()])
-    claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
+    claim = ("cannot be distinguished from", "is worse than", "beats")[sign(results, trained, other)]
     evidence = ", ".join(
         f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in intervals.items()
     )

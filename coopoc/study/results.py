@@ -1,7 +1,7 @@
 """Results: the tidy frame of a study, one row per (cell, run, ego), and its means with intervals."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,10 @@ class Results:
         """Number of failed cells."""
         return len(self.failures)
 
+    def with_failed(self) -> "Results":
+        """The same with a row without numbers for each failed cell, if any has finished."""
+        return replace(self, frame=pd.concat([self.frame, self.failures])) if len(self.frame) else self
+
     def select(self, where: Params | None = None, **also: Any) -> DataFrame:
         """Rows where each named column has the value, or one of a list of values.
 
@@ -144,10 +148,11 @@ class Results:
         rows = []
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
-            table = ego_by_run(frame, value)
+            table = ego_by_run(frame[frame["status"] != "failed"] if "status" in frame else frame, value)
             grid = whole(table)
             each = mean_interval(grid.to_numpy().T) if grid.size else NO_VALUES
-            rows.append([*names, *vars(each).values(), len(table) - len(grid)])
+            missing = len(table) - len(grid) * bool(grid.size or frame[value].isna().all())
+            rows.append([*names, *vars(each).values(), missing])
         return DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
     def _one_cell(self, frame: DataFrame, by: Sequence[str], value: str) -> None:
@@ -174,14 +179,15 @@ def _joined(tables: Sequence[pa.Table]) -> DataFrame:
 
 
 def ego_by_run(frame: DataFrame, value: str) -> DataFrame:
-    """Egos x runs: means over training seeds, NaN where a seed has none; rows without ego or run count as one.
+    """Egos x runs: means over training seeds, NaN where a seed has no finite one; rows without ego or run count as one.
 
     >>> ego_by_run(DataFrame({"x": [1.0, 3.0], "run": [None, None]}), "x").to_numpy().tolist()
     [[2.0]]
     """
     keys = frame.reindex(columns=["ego", "run"])
     keys = keys.astype(object).where(keys.notna(), 0)
-    cells = frame[value].astype(float).groupby([keys["ego"], keys["run"]])
+    values = frame[value].astype(float)
+    cells = values.where(np.isfinite(values)).groupby([keys["ego"], keys["run"]])
     return cells.mean().where(cells.count() == cells.size()).unstack("run")
 
 

@@ -5,8 +5,9 @@ import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from math import isfinite, isnan
+from math import floor, isfinite, isnan, log10
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Literal, TypeAlias
 
 from tabulate import tabulate
@@ -16,7 +17,7 @@ from ..errors import InputError
 from ..evaluate.statistics import WORSE_RATIO, Interval
 from ..paths import write
 from ..text import markdown, spreadsheet, tex, visible
-from .numbers import Number, Results, Where, alike
+from .numbers import EQUAL_SHARE, Number, Results, Where, failures, sign
 from .style import METHODS, NOT_CAUSAL_SUFFIX, label, title, words
 
 Entry: TypeAlias = Interval | float | int | str | None
@@ -36,9 +37,9 @@ class Table:
         header: column titles, with units.
         rows: entries, as many per row as titles.
         caption: with the noise settings; it goes above the table in every format.
-        best: "min" or "max": the number in bold, and those alike; nothing where all are.
+        best: "min" or "max": the number in bold, and those alike or within EQUAL_SHARE; nothing where all are.
         along: "row" or "column": where the best number is sought.
-        decimals: of numbers.
+        decimals: of numbers, at least: the least of the best has two digits.
         intervals: show the ends.
         notes: sentences under the table.
         alike: (row, column) of numbers that noise may explain to be worse than the best.
@@ -52,6 +53,10 @@ class Table:
     |   K |                KF |
     |----:|------------------:|
     |   1 | 0.80 [0.75, 0.85] |
+    >>> print(Table(("K", "KF", "OKF"), ((1, 0.0123, 0.0124),), "", "min").to_markdown())
+    |   K |        KF |   OKF |
+    |----:|----------:|------:|
+    |   1 | **0.012** | 0.012 |
     """
 
     header: tuple[str, ...]
@@ -154,20 +159,23 @@ class Table:
 
     def _body(self, escaped: Callable[[str], str], strong: str, ends: str) -> list[list[str]]:
         """Entries in a format: `strong` is the pattern of the best mean, `ends` that of an interval's ends."""
-        bold, body = self._bold(), []
+        bold, body = self._bold(), list[list[str]]()
+        least = min((abs(group[0][0]) for group in self.ranked() if group[0][0]), default=1.0)
+        decimals = max(self.decimals, 1 - floor(log10(least)))
+
+        def shown(value: float) -> str:
+            return "–" if isnan(value) else f"{value:.{decimals}f}"
+
         for i, row in enumerate(self.rows):
             texts = []
             for j, entry in enumerate(row):
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                text = escaped(self._number(mean) if isinstance(mean, float) else "–" if mean is None else str(mean))
+                text = escaped(shown(mean) if isinstance(mean, float) else "–" if mean is None else str(mean))
                 texts.append(strong.format(text) if (i, j) in bold else text)
                 if isinstance(entry, Interval) and self.intervals and not isnan(entry.low):
-                    texts[-1] += ends.format(f"[{self._number(entry.low)}, {self._number(entry.high)}]")
+                    texts[-1] += ends.format(f"[{shown(entry.low)}, {shown(entry.high)}]")
             body.append(texts)
         return body
-
-    def _number(self, value: float) -> str:
-        return "–" if isnan(value) else f"{value:.{self.decimals}f}"
 
     def _sides(self, left: str, right: str) -> tuple[str, ...]:
         """Alignment of each column: text at the left, numbers at the right."""
@@ -175,16 +183,17 @@ class Table:
         return tuple(left if any(isinstance(e, str) for e in column) else right for column in columns)
 
     def _bold(self) -> set[tuple[int, int]]:
-        """(row, column) of the best numbers, as far as they are shown, and of those alike."""
+        """(row, column) of the best numbers and of those alike."""
         bold = set()
         for group in self.ranked():
-            same = [(i, j) for mean, i, j in group if mean == group[0][0] or (i, j) in self.alike]
+            best = group[0][0]
+            same = [(i, j) for n, i, j in group if abs(n - best) <= EQUAL_SHARE * abs(best) or (i, j) in self.alike]
             if len(same) <= max(2, len(group) / 2) and len(same) < len(group):  # what three and most have is none
                 bold |= {*same}
         return bold
 
     def ranked(self) -> list[list[tuple[float, int, int]]]:
-        """For each row or column: its numbers as they are shown, each with row and column, the best first."""
+        """For each row or column: its numbers, each with row and column, the best first."""
         places: dict[int, list[tuple[float, int, int]]] = {}
         if self.best is None:
             return []
@@ -193,7 +202,7 @@ class Table:
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
                 if isinstance(mean, float) and isfinite(mean) and not (names & UNRANKED or smooths(names)):
-                    places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
+                    places.setdefault(i if self.along == "row" else j, []).append((mean, i, j))
         return [sorted(group, reverse=self.best == "max") for group in places.values()]
 
 
@@ -218,17 +227,17 @@ def pivot(
         where: column -> value or values.
         caption: of the table; default the metric.
         best: "min", "max" or None, sought among the methods.
-        decimals: of numbers.
+        decimals: as of `Table`.
         intervals: show the ends.
 
     Raises:
         InputError: as `Results.summary`.
     """
     down, across = ([names] if isinstance(names, str) else list(names) for names in (rows, columns))
-    summary = results.summary([*down, *across], value, where)
+    summary = results.with_failed().summary([*down, *across], value, where)
     same = [name for name in down if len(down) > 1 and summary[name].nunique(dropna=False) == 1]
     in_all = [f"{words(name)}: {label(name, summary[name].iloc[0])}." for name in same]  # and no column
-    if intervals:
+    if intervals and summary["low"].notna().any():
         in_all.append("In brackets: 95 % interval.")
     caption = " ".join([caption or f"{words(value)}.", *in_all])
     down = [name for name in down if name not in same] or down[:1]
@@ -240,12 +249,13 @@ def pivot(
     body = []
     for labels in sorted(of, key=smooths):
         matches = (of[labels].get(text) for text in titles)
-        entries = (
-            Interval(row["mean"], row["low"], row["high"], row["n"]) if row and row["n"] else None for row in matches
-        )
+        ends = "mean", "low", "high", "n"
+        entries = (Interval(*(row[name] for name in ends)) if row and row["n"] else None for row in matches)
         body.append((*labels, *entries))
-    missing = int(summary["missing"].sum())
-    gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
+    gone = []
+    for name, part in _by_method(summary[summary["missing"] > 0]):
+        egos = f"{part['missing'].max()} egos of {name} are left out"
+        gone.append(f"{egos} of {len(part)} means, as a run of theirs has no finite number.")
     if best and any(map(smooths, of)):
         gone.append("What knows later measurements, or draws random numbers anew, is not ranked.")
     made = Table(
@@ -256,15 +266,15 @@ def pivot(
         "column" if "method" in down else "row",
         decimals=decimals,
         intervals=intervals,
-        notes=(*gone, *lost(results, where)),
+        notes=(*gone, *failed(results, where or {}), *lost(results.with_failed(), where)),
     )
     same_as_best = []
     for ranked in made.ranked():
         first, *others = (of[made.rows[i][: len(down)]][made.header[j]] for _, i, j in ranked)
         for (_, i, j), row in zip(ranked[1:], others, strict=True):
-            near = max(row["low"], first["low"]) <= min(row["high"], first["high"])  # else pairs are apart, too
             one, other = ({**(where or {}), **{k: each[k] for k in (*down, *across)}} for each in (first, row))
-            if near and alike(results, one, other, value):
+            apart = row["low"] > first["high"] or row["high"] < first["low"]  # then pairs are, too
+            if not (apart or sign(results, one, other, value)):
                 same_as_best.append((i, j))
     made = replace(made, alike=tuple(same_as_best))
     bold = " Bold: the best, and those whose difference from it noise may explain." * bool(made._bold())
@@ -280,18 +290,28 @@ def smooths(labels: Iterable[object]) -> bool:
     return any(mark in str(name) for name in labels for mark in _SMOOTHERS)
 
 
+def failed(results: Results, *wheres: Where) -> list[str]:
+    """A sentence for each method with failed cells in one of the selections: how many, and the first reason."""
+    rows = results.failures.loc[sorted({index for where in wheres for index in failures(results, where).index})]
+    texts = []
+    for name, part in _by_method(rows):
+        reason = shorten(part["reason"].iloc[0].rstrip("."), 200)
+        texts.append(f"Failed cells of {name}: {len(part)}, first reason: {reason}.")
+    return texts
+
+
 def lost(results: Results, where: Where | None = None) -> list[str]:
     """A sentence for each method whose estimates left the fixes by more than 100 standard deviations."""
-    frame = results.select(where)
-    if "left_fixes" not in frame or "method" not in frame:
-        return []
-    runs = frame.groupby("method", sort=False)["left_fixes"].agg(lambda flags: int((flags > 0).sum()))
+    rows = results.select(where)
     text = "{} diverged in {} rows: an estimate is more than 100 standard deviations away from a fix."
-    return [text.format(label("method", name), count) for name, count in runs.items() if count]
+    far = rows[rows["left_fixes"] > 0] if "left_fixes" in rows else rows[:0]
+    return [text.format(name, len(part)) for name, part in _by_method(far)]
 
 
-EQUAL_ERRORS_M = 1e-3
-"""Difference of errors that is none."""
+def _by_method(rows: Any) -> list[tuple[str, Any]]:
+    """Label of each method, or of all, and its rows."""
+    by = "method" if "method" in rows else lambda _: "the study"
+    return [(label("method", name), part) for name, part in rows.groupby(by, sort=False)]
 
 
 def unused(results: Results, real: bool) -> list[str]:
@@ -307,12 +327,12 @@ def unused(results: Results, real: bool) -> list[str]:
         own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
         both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
         together, alone = (both[f"{value}_{side}"] for side in "xy")
-        gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
+        gap = (together / alone - 1).abs().groupby([both[key] for key in keys], dropna=False).min()
         text = f"{label('method', method)}, K = {k}:"
-        if k and len(gap) == len(part) and gap.max() < EQUAL_ERRORS_M:
-            lacks = "what was measured lacks what it takes, such as an azimuth"
+        if k and len(gap) == len(part) and gap.max() < EQUAL_SHARE:
+            lacks = "what was measured lacks what it takes, such as an azimuth, or says far less than fixes"
             why = lacks if part["bytes_per_second"].any() else "no message arrived"
-            text += f" equal to solo within {EQUAL_ERRORS_M:g} m: no neighbour's measurement was used, because {why}."
+            text += f" equal to solo within {EQUAL_SHARE:.1%}: no neighbour's measurement had an effect, because {why}."
         elif k and real and together.mean() > WORSE_RATIO * alone.mean():
             text += f" worse than alone, {together.mean():.3g} m for {alone.mean():.3g} m: what was measured of "
             text += "neighbours, or its stated noise, is wrong. coopoc data check says what looks so."
