@@ -5,13 +5,20 @@ show a line of names and shapes.
 """
 
 import re
+import textwrap
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from enum import Enum
 from typing import Any
 
+_MATHEMATICS = (
+    "± pm ≤ le ≥ ge × times ≈ approx → to ∞ infty α alpha β beta γ gamma δ delta ε epsilon ζ zeta η eta θ theta ι iota "
+    "κ kappa λ lambda μ mu ν nu ξ xi π pi ρ rho ς varsigma σ sigma τ tau υ upsilon φ phi χ chi ψ psi ω omega Γ Gamma "
+    "Δ Delta Θ Theta Λ Lambda Ξ Xi Π Pi Σ Sigma Υ Upsilon Φ Phi Ψ Psi Ω Omega"
+)
 _LATEX = {
+    **{letter: rf"$\{name}$" for letter, name in re.findall(r"(\S) (\S+)", _MATHEMATICS)},
     "\\": r"\textbackslash{}",
     "&": r"\&",
     "%": r"\%",
@@ -22,12 +29,8 @@ _LATEX = {
     "}": r"\}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
-    "±": r"$\pm$",
     "–": "--",
-    "≤": r"$\le$",
-    "≥": r"$\ge$",
-    "×": r"$\times$",
-    "σ": r"$\sigma$",
+    "−": "$-$",
     "°": r"$^\circ$",
     "²": "$^2$",
     "<": r"\textless{}",
@@ -67,6 +70,15 @@ def picture(text: str) -> str:
     return f" {line}" if line.startswith("_") else line
 
 
+def wrapped(text: str) -> str:
+    """`picture` of a name in lines of at most 40 letters.
+
+    >>> wrapped("a " * 21)
+    'a a a a a a a a a a a a a a a a a a a a\\na'
+    """
+    return "\n".join(map(picture, textwrap.wrap(visible(text), 40)))
+
+
 def spreadsheet(text: str) -> str:
     """Text that a spreadsheet takes for text, without control characters: behind an apostrophe if it would be a formula
     and is no number.
@@ -94,12 +106,18 @@ def markdown(text: str) -> str:
 
 
 def tex(text: str) -> str:
-    r"""Text on one line without a command of LaTeX.
+    r"""Text on one line without a command of LaTeX; a symbol that it lacks is named.
 
-    >>> tex(r"\input{x}")
-    '\\textbackslash{}input\\{x\\}'
+    >>> tex(r"\input{x}"), tex("α ∇")
+    ('\\textbackslash{}input\\{x\\}', '$\\alpha$ (nabla)')
     """
-    return "".join(_LATEX.get(letter, letter) for letter in visible(text))
+    return "".join(map(_tex, unicodedata.normalize("NFC", visible(text))))
+
+
+def _tex(letter: str) -> str:
+    if letter in _LATEX or letter < "\u0100" or unicodedata.category(letter) not in ("Sm", "So", "Mn"):
+        return _LATEX.get(letter, letter)
+    return f"({unicodedata.name(letter, 'symbol').lower()})"
 
 
 FEW_ENTRIES, LONGEST_FIELD = 4, 60

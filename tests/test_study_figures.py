@@ -21,6 +21,7 @@ from coopoc.studies.error_cdf import quantile
 from coopoc.study import figures
 from coopoc.study.results import Results
 from coopoc.study.style import METHODS, Panel, look
+from coopoc.study.tables import pivot
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +114,8 @@ def test_a_distribution_is_that_of_all_steps(results):
 @pytest.mark.parametrize("suffix", ["svg", "png"])
 def test_no_letter_of_the_legend_is_cut_off(results, tmp_path, suffix):
     """Letters are hinted wider at the 72 dpi of PDF and SVG than at others, and the legend must fit in all of them."""
-    plot = PLOTS["curves"](results)
+    frames = [results.frame.assign(method=f"{number}.py:{'long' * 20}{number}") for number in range(20)]
+    plot = PLOTS["sweep"](replace(results, frame=pd.concat(frames).assign(noise_model="a")))
     plot.save(tmp_path / "a")
     plot.figure.set_dpi({"svg": 72, "png": 200}[suffix])
     plot.figure.draw_without_rendering()
@@ -169,6 +171,17 @@ def test_every_line_that_coincides_is_named(results):
     )
     first, *_ = plot.figure.axes[0].get_legend().get_texts()
     assert first.get_text() == "KF\nidentity ≈ FedKalmanNet\nfitted ≈ OKF"
+
+
+def test_a_failed_cell_is_a_gap_with_its_reason(results):
+    failed = results.frame.query("method == 'gnss' or method == 'joint' and max_neighbours == 2")
+    once = failed.query("run == 0").assign(status="failed", reason="Boom").reset_index()
+    known = replace(results, frame=results.frame.drop(failed.index), failures=once)
+    plot, table = PLOTS["sweep"](known), pivot(known, ["method", "noise_model"], "max_neighbours", "rt_le_m")
+    assert np.isnan(plot.figure.axes[0].lines[2].get_ydata()).tolist() == [False, True, False]
+    assert table.rows[-1] == ("GNSS", "identity", None, None, None)
+    assert plot.caption.endswith(" ".join(table.notes))
+    assert "Failed cells of GNSS: 3, first reason: Boom. Failed cells of Joint filter: 1, " in table.words
 
 
 def from_reference(file):

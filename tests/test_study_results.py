@@ -204,6 +204,6 @@ def test_what_cannot_be_shown_is_named():
 
 
 def test_latex_compiles(tmp_path):
-    odd = Table(tuple(r"&%$#_{}~^\<>|"), (tuple("±–≤≥×σ°²wxyz|"),) * 2, "100 % & more_")
+    odd = Table(tuple(r"[%$#_{}~^\<>&"), (tuple("[–≤Δ×σ°²−é🚗o|"), tuple("*αΩ→∇≈±µ“”yz|")), "100 % & more_")
     wide = Table(("Method", *map(str, range(12))), (("KF", *(Interval(0.5, 0.4, 0.6, 30),) * 12),), "Wide.")
     assert "Overfull" not in compiled(TABLE.to_latex() + odd.to_latex() + wide.to_latex(), tmp_path)

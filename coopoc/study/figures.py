@@ -9,10 +9,12 @@ from matplotlib.patheffects import withStroke
 
 from ..errors import InputError
 from ..evaluate.statistics import Interval
-from ..text import picture
-from .numbers import Number, Results, Where, interval, mean, ran
-from .plot import Plot, canvas, legend, name_of, plain_log, strokes
+from ..text import picture, wrapped
+from .numbers import Number, Results, Where, failures, interval, mean, ran
+from .plot import Plot, canvas, legend, name_of, place, plain_log, strokes
+from .results import NO_VALUES
 from .style import Panel, label, look, words
+from .tables import failed
 
 __all__ = ["Plot", "curves", "pareto", "sweep"]
 
@@ -38,14 +40,19 @@ def sweep(results: Results, x: str, where: Where | None = None, caption: str = "
     >>> axes = sweep(Results("s", "?", (), {}, frame, frame[:0], 0, {}), "weather").figure.axes[0]
     >>> [text.get_text() for text in axes.get_xticklabels()], axes.lines[0].get_xdata(orig=False).tolist()
     (['\\\\$rain', 'None'], [0.0, 1.0])
+    >>> both = DataFrame({"a": [1, 2], "x": [0, 0], "ego": "e", "run": 0, "rt_le_m": [1.0, 2.0]})
+    >>> axes = sweep(Results("s", "?", ("a", "x"), {}, both, both[:0], 0, {}), "x").figure.axes[0]
+    >>> [text.get_text() for text in axes.get_legend().get_texts()], len({line.get_color() for line in axes.lines})
+    (['A = 1', 'A = 2'], 2)
     """
-    rows = results.select(where)
+    rows = results.with_failed().select(where)
     values = [None if value != value else value for value in rows[x].sort_values().unique()]
     named = any(isinstance(value, str | None) for value in values)
     places = {picture(label(x, value, values)) if named else value: {x: value} for value in values}
     panel = Panel(places, dict(where or {}), xlabel=words(x))
     names = _line_names(results, x)
-    lines = [dict(zip(names, line, strict=True)) for line in rows[names].drop_duplicates().itertuples(index=False)]
+    each = rows[names].drop_duplicates().astype(object)
+    lines: list[Any] = each.where(each.notna(), None).to_dict("records") if names else [{}]
     text = caption or f"{words('rt_le_m')} against {words(x)}. Bands: 95 % intervals over egos, then runs."
     plot = curves(results, [panel], lines, text, interval, ylabel=words("rt_le_m"), log=log, width=6.4)
     if plot is None:
@@ -93,13 +100,12 @@ def pareto(results: Results, caption: str, x: str = "bytes_per_second", where: W
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words("rt_le_m"))
-        also = {
-            name_of(alike[0]): f" ({alike[0].get('noise_model')}{_joined(alike).removeprefix(_joined(alike[:1]))})"
-            for alike in groups
-            if len(alike) > 1
-        }
+        also = {}
+        for alike in groups:
+            more, model = _joined(alike).removeprefix(_joined(alike[:1])), alike[0].get("noise_model")
+            also[name_of(alike[0])] = f" ({model}{more})" if more and model else more
         legend(panel, [alike[0] for alike in groups], also)
-    return Plot(figure, caption)
+    return Plot(figure, " ".join([caption, *failed(results, where or {})]))
 
 
 STYLE = ("label", "color", "marker", "linestyle", "linewidth")
@@ -135,36 +141,46 @@ def curves(
         log: logarithmic vertical axis; a linear one starts at zero.
         logx: logarithmic horizontal axes.
     """
-    every, shown = [*lines, *levels], []
+    every, shown, absent = [*lines, *levels], [], list[Where]()
+
+    def at(*parts: Where) -> Any:
+        """The number of a selection: None if it was not run, NO_VALUES if it failed."""
+        where = {name: value for part in parts for name, value in part.items() if name not in STYLE}
+        if (value := number(results, where)) is None and len(failures(results, where)):
+            absent.append(where)
+            return NO_VALUES
+        return value
+
     models = {of["noise_model"] for of in every if "noise_model" in of and of.get("method") != "bound"}
-    models -= {"none", "trained"}
+    models -= {"none", "trained", None}
     labelled = any("label" in of for of in every)
     for panel in panels:
         drawn = []
         for of in lines:
-            points = ran({x: number(results, {**panel.where, **also, **_where(of)}) for x, also in panel.x.items()})
-            drawn += [(of, points)] if points else []
+            points = ran({x: at(panel.where, more, of) for x, more in panel.x.items()})
+            drawn += [(of, points)] if _heights(points) else []
         if drawn or len(panels) == 1:
-            flat = [(of, y) for of in levels if (y := number(results, {**panel.where, **_where(of)})) is not None]
+            flat = [(of, y) for of in levels if _heights(y := at(panel.where, of))]
             shown.append((panel, [*drawn, *flat]))
     if not any(drawn for _, drawn in shown):
         return None
     coinciding, near = _coinciding(shown, log)
     groups = {id(group[0]): group for group in coinciding}
-    size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": 3.1}
-    with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
+    width = width or 2.2 + 2.1 * len(shown) + (len(shown) == 1)
+    with canvas(1, len(shown), width, 3.1, sharey=True, squeeze=False) as (figure, (axes,)):
         named, also = list[dict[str, Any]](), dict[str, str]()
         for axis, (panel, drawn) in zip(axes, shown, strict=True):
             for of, points in drawn:
                 if id(of) not in groups:
                     continue
-                names = {name: of[name] for name in ("method", "noise_model") if name in of}
-                if len(models) < 2 and of.get("method") != "bound":
+                usual = ("method", "noise_model") if "method" in of else of
+                names = {name: of[name] for name in usual if name in of and name not in STYLE}
+                if len(models) < 2 and of.get("method", "bound") != "bound":
                     names["noise_model"] = "none"
                 text = _joined(groups[id(of)], models)
                 style = {name: of[name] for name in STYLE if name in of}
-                if labelled or len(groups[id(of)]) > 1:
-                    style["label"] = text if labelled else f"_{text}"
+                if labelled:
+                    style["label"] = wrapped(text)
                 _draw(axis, names, points, style)
                 named += [names] if names not in named else []
                 more, model = text.removeprefix(_joined([of])), str(of.get("noise_model"))
@@ -186,15 +202,10 @@ def curves(
         else:
             axes[0].set_ylim(0)
         if labelled:
-            axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
+            place(axes[-1], axes[-1].get_legend_handles_labels()[0])
         else:
             legend(axes[-1], named, also)
-    return Plot(figure, caption)
-
-
-def _where(of: Where) -> Where:
-    """What a line selects."""
-    return {name: value for name, value in of.items() if name not in STYLE}
+    return Plot(figure, " ".join([caption, *failed(results, *absent)]))
 
 
 def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near: float) -> None:
@@ -208,10 +219,10 @@ def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near:
     """
     for group in _coinciding([("", drawn)], log, near)[0]:
         if len(group) > 1:
-            x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
+            x, y = list(_heights(next(points for of, points in drawn if of is group[0])).items())[-1]
             halo = [withStroke(linewidth=2, foreground="white")]
             offset: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right"}
-            axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **offset)
+            axes.annotate(wrapped(_joined(group)), (x, y), fontsize=7, path_effects=halo, **offset)
 
 
 LINE_SHARE = 0.009
@@ -221,21 +232,27 @@ panel they are named together."""
 
 def _coinciding(shown: Sequence[Any], log: bool, near: float | None = None) -> tuple[list[list[Where]], float]:
     """Lines, each with those that lie near it at every point of every panel, and what is near: by default a line's
-    width of what all span, from zero or in the logarithm. A bound stands alone."""
+    width of what all span, from zero or in the logarithm. A bound stands alone.
+
+    >>> drawn = [({"label": name}, {0: y}) for name, y in {"A": 0.0, "B": 1.0, "C": 1.0, "D": float("nan")}.items()]
+    >>> [[of["label"] for of in group] for group in _coinciding([("", drawn)], log=True)[0]]
+    [['A'], ['B', 'C'], ['D']]
+    """
     lines: dict[int, tuple[Where, dict[Any, float]]] = {}
     for panel, (_, drawn) in enumerate(shown):
         for of, points in drawn:
-            values = points if isinstance(points, Mapping) else {"": points}
-            heights = {(panel, x): np.log(_mean(v)) if log else _mean(v) for x, v in values.items()}
+            heights = {(panel, x): np.log(y) if log else y for x, y in _heights(points).items() if y > 0 or not log}
             lines.setdefault(id(of), (of, {}))[1].update(heights)
     if near is None:
         every = [y for _, heights in lines.values() for y in heights.values()]
-        near = LINE_SHARE * (max(every) - (min(every) if log else 0.0))
+        near = LINE_SHARE * (max(every, default=0.0) - (min(every, default=0.0) if log else 0.0))
     groups: list[list[Where]] = []
     for of, heights in lines.values():
         for group in groups:
             other = lines[id(group[0])][1]
-            same = heights.keys() == other.keys() and all(abs(heights[at] - y) <= near for at, y in other.items())
+            same = heights.keys() == other.keys() != set() and all(
+                abs(heights[at] - y) <= near for at, y in other.items()
+            )
             if same and "bound" not in (of.get("method"), group[0].get("method")):
                 group.append(of)
                 break
@@ -267,6 +284,12 @@ def _line_names(results: Results, *across: str) -> list[str]:
 
 def _mean(point: Any) -> float:
     return float(point.mean if isinstance(point, Interval) else point)
+
+
+def _heights(points: Any) -> dict[Any, float]:
+    """Place -> mean, without those that failed; "" -> that of a level."""
+    means = ran(points if isinstance(points, Mapping) else {"": points})
+    return {x: _mean(y) for x, y in means.items() if _mean(y) == _mean(y)}
 
 
 def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> None:

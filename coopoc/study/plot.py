@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from ..paths import write
-from ..text import picture
-from .style import RC, line, look
+from ..text import wrapped
+from .style import OWN_LOOKS, RC, line, look, title
 
 FIXED = {
     "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
@@ -67,24 +67,23 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
         grid: options of `Figure.subplots`.
     """
     with style.context(["default", RC]):
+        OWN_LOOKS.clear()  # all of them are for the lines of one figure
         figure = Figure(figsize=(width, height))
         yield figure, figure.subplots(rows, columns, **grid)
 
 
 def name_of(names: Mapping[str, Any]) -> str:
     """The method of a line; without one, its other names."""
-    return str(names["method"]) if "method" in names else ", ".join(map(str, names.values()))
+    return str(names["method"]) if "method" in names else ", ".join(title(*item) for item in names.items())
 
 
 def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
-    """Line options of a method (colour, marker, name) and of a noise model (line style); a bound is dashed, with the
-    past of newcomers dotted."""
+    """Line options of a method (colour, marker) and of a noise model (line style); a bound is dashed, with the past of
+    newcomers dotted."""
     shown, model = look(name_of(names)), str(names.get("noise_model"))
     bound = ":" if model == "with its past" else "--"
     dashes = bound if name_of(names) == "bound" else line(model)
-    text = f"_{shown.label}" + (f", {model}" if model in ("identity", "fitted", "with its past") else "")
-    look_of = {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
-    return {**look_of, "label": text}  # legends of matplotlib's own leave it out
+    return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
 
 
 def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None) -> None:
@@ -101,7 +100,7 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
     entries: dict[str, dict[str, Any]] = {}
     styles: dict[Any, list[str]] = {}
     for names in lines:
-        method, model = name_of(names), str(names.get("noise_model", "none"))
+        method, model = name_of(names), str(names.get("noise_model") or "none")
         text = look(method).label + (words or {}).get(method, "")
         if method == "bound":
             text += f", {model}" if len(bounds) > 1 else ""
@@ -109,13 +108,28 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
             styles[line(model)].append(model)
         entries.setdefault(text, strokes(names if method == "bound" or "method" not in names else {"method": method}))
     handles = [
-        Line2D([], [], **{**options, "label": "\n".join(map(picture, text.split("\n")))})
+        Line2D([], [], **{**options, "label": "\n".join(map(wrapped, text.split("\n")))})
         for text, options in entries.items()
     ]
     if len(styles) > 1:
-        grey = {dashes: picture(" / ".join(models)) for dashes, models in styles.items()}
-        handles += [Line2D([], [], color="#555555", linestyle=dashes, label=text) for dashes, text in grey.items()]
-    axes.legend(handles=handles, loc="upper left", handlelength=2.6, bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
+        for dashes, models in styles.items():
+            handles.append(Line2D([], [], color="#555555", linestyle=dashes, label=wrapped(" / ".join(models))))
+    place(axes, handles, handlelength=2.6)
+
+
+MOST_ENTRIES, ENTRY_HEIGHT = 60, 0.17
+"""Of a legend; inches of one line of it."""
+
+
+def place(axes: Axes, handles: Sequence[Any], **options: Any) -> None:
+    """Draw a legend at the right, its figure as high as it needs; it says how many lines it does not name."""
+    if len(handles) > MOST_ENTRIES:
+        more = f"{len(handles) - MOST_ENTRIES} more are not named"
+        handles = [*handles[:MOST_ENTRIES], Line2D([], [], linestyle="none", label=more)]
+    figure: Any = axes.figure
+    rows = sum(1 + handle.get_label().count("\n") for handle in handles)
+    figure.set_figheight(max(figure.get_figheight(), ENTRY_HEIGHT * rows + 0.4))
+    axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0, **options)
 
 
 def plain_log(axis: XAxis | YAxis) -> None:

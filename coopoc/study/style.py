@@ -56,11 +56,13 @@ NOT_CAUSAL_SUFFIX = ", not causal"
 """In the label of a method whose estimates change with what is measured later."""
 OWN_NAMES: dict[str, str] = {}
 """Method that is none of ours -> the name that its class gives itself, as its rows have it."""
+OWN_LOOKS: dict[str, int] = {}
+"""Such a method -> the number of its colour and marker."""
 
 
 def look(method: str) -> Look:
-    """The look of a method; a number at its end is a client, in a colour of its own; an unknown one has a look that its
-    name alone decides.
+    """The look of a method; a number at its end is a client, in a colour of its own; an unknown one has one that no
+    other has, until all are taken.
 
     >>> look("okf").label, look("individual2").label, look("mine.py:Alpha").label
     ('OKF', 'Individual KalmanNet 2', 'Alpha')
@@ -74,7 +76,9 @@ def look(method: str) -> Look:
         color = CLIENTS[(int(number) - 1) % len(CLIENTS)] if number.isdecimal() else shown.color
         return Look(f"{shown.label} {number}", color, shown.marker)
     full_name, method = method, method.rpartition(".py:")[2]  # of a file: its name there
-    row, column = divmod(zlib.crc32(method.encode()) % 25, 5)
+    start, taken = zlib.crc32(method.encode()), OWN_LOOKS.values()
+    free = (k % 25 for k in range(start, start + 25) if k % 25 not in taken)
+    row, column = divmod(OWN_LOOKS.setdefault(full_name, next(free, start % 25)), 5)
     return Look(OWN_NAMES.get(full_name, method.replace("_", " ")), COLORS[column], "<>d8H"[row])
 
 

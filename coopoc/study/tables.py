@@ -26,6 +26,7 @@ UNRANKED = {METHODS["bound"].label, METHODS["oracle"].label, "oracle", "Differen
 """Row labels and titles (or parts of a title between commas) that are never the best."""
 _SMOOTHERS = METHODS["batch-smoother"].label, NOT_CAUSAL_SUFFIX
 """Label of the method that uses later measurements, too: it is not compared with the others."""
+MOST_DECIMALS, LONGEST_REASON = 9, 200
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
 
@@ -132,9 +133,9 @@ class Table:
             r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}",
             r"\toprule",
-            " & ".join(map(tex, self.header)) + r" \\",
+            _tex_row([*map(tex, self.header)]),
             r"\midrule",
-            *(" & ".join(row) + r" \\" for row in body),
+            *map(_tex_row, body),
         ]
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}}", r"\end{table}", ""])
 
@@ -161,7 +162,7 @@ class Table:
         """Entries in a format: `strong` is the pattern of the best mean, `ends` that of an interval's ends."""
         bold, body = self._bold(), list[list[str]]()
         least = min((abs(group[0][0]) for group in self.ranked() if group[0][0]), default=1.0)
-        decimals = max(self.decimals, 1 - floor(log10(least)))
+        decimals = max(self.decimals, min(1 - floor(log10(least)), MOST_DECIMALS))
 
         def shown(value: float) -> str:
             return "–" if isnan(value) else f"{value:.{decimals}f}"
@@ -295,7 +296,7 @@ def failed(results: Results, *wheres: Where) -> list[str]:
     rows = results.failures.loc[sorted({index for where in wheres for index in failures(results, where).index})]
     texts = []
     for name, part in _by_method(rows):
-        reason = shorten(part["reason"].iloc[0].rstrip("."), 200)
+        reason = shorten(part["reason"].iloc[0].rstrip("."), LONGEST_REASON)
         texts.append(f"Failed cells of {name}: {len(part)}, first reason: {reason}.")
     return texts
 
@@ -363,13 +364,23 @@ def crossed(
     Returns:
         The table, or None if no row was run.
     """
-    body = []
+    body, wheres = [], []
     for labels, where in rows:
+        wheres.append(where)
         entries = [number(results, where) for number in columns.values()]
-        if any(entry is not None for entry in entries):
+        if any(entry is not None for entry in entries) or len(failures(results, where)):
             body.append((*labels, *entries))
-    options["notes"] = (*options.get("notes", ()), *lost(results))
+    options["notes"] = (*options.get("notes", ()), *failed(results, *wheres), *lost(results))
     return Table((*head, *columns), tuple(body), caption, **options) if body else None
+
+
+def _tex_row(texts: Sequence[str]) -> str:
+    r"""A row; [ or * at its begin is no argument of the command before.
+
+    >>> _tex_row(("*a", "1"))
+    '{}*a & 1 \\\\'
+    """
+    return "{}" * texts[0].startswith(("[", "*")) + " & ".join(texts) + r" \\"
 
 
 def _columns(entry: Entry, wide: bool) -> list[object]:
