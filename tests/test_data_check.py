@@ -47,6 +47,7 @@ FAULTS: dict[str, tuple[Any, str]] = {
         lambda f: f.assign(x=f["x"] + 15 * f.index.isin(np.flatnonzero(f["x"].notna())[::20])),
         r"car0: [45]\.\d% of the fixes lie beyond 5",
     ),
+    "deviations in degrees": (lambda f: f.assign(yaw_rate=0.0, yaw_rate_std=0.6), "yaw_rate are 0.6 rad: if.*:0.0105"),
     "ranges of one end": (
         lambda f: pd.concat(
             [f, f.dropna(subset="range").eval("vehicle = partner\npartner = 'car0'\nrange = range + 1")]

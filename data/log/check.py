@@ -41,6 +41,7 @@ from .estimates import (
     ratio_of_moves,
     worst,
 )
+from .frames import TOO_WIDE
 from .motion import HOLDS, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
 from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
@@ -75,7 +76,7 @@ USED_COUNTS = "fixes", "relative measurements", "edges", "messages"
 """Counts of the summary that say how much was used; those of odometry and headings do not."""
 EXPECTED = "steps of", "fixes and relative measurements that hold", "incomplete rows"
 """Beginnings of reasons that are no fault of the log, or named of each vehicle."""
-FAULTS = "stamps of", "fixes far from", SEVERAL.split("{")[0], OTHER_RATES.split("{")[0]
+FAULTS = "stamps of", "fixes far from", TOO_WIDE, SEVERAL.split("{")[0], OTHER_RATES.split("{")[0]
 """Beginnings of what is assumed that is a fault."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {

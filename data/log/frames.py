@@ -13,12 +13,14 @@ from coopoc.arrays import Bools, Floats, checked, refuse
 from coopoc.formats.values import QUATERNION_ROUNDING, to_rotation
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
+from coopoc.world.recording import DEGREES_STD
 
 from ..assemble import PLANE_STD
 from ..cells import Factors, factors
 from .units import (
     ANGLES,
     BODY,
+    DEGREE,
     KEYS,
     KIND_TABLE,
     QUATERNION,
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
     from .motion import Member, Steps
 
 UNSTATED = "standard deviations of {}: none was logged"
+TOO_WIDE = "stated deviations of"
+"""Beginnings of sentences on deviations that were not logged, or are rather in degrees."""
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed", "vy_body")
 Origin = tuple[float, float, float]
@@ -264,6 +268,9 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
             assume(UNSTATED, f"{default:.3g} {unit} ({names[0]})")
         return default
 
+    usual = only(rows, *ANGLES, "yaw_rate").groupby("kind")["std"].median()
+    for kind, std in usual[usual > DEGREES_STD].items():
+        assume(f"{TOO_WIDE} {kind} are {std:.3g} rad: if they are degrees, std={kind}:{DEGREE * std:.3g} mends it")
     x, y, z = base.gnss_std
     up = PLANE_STD if steps.planar else of(z, "m", "z")
     noise: dict[str, Any] = {
