@@ -346,12 +346,18 @@ def test_odometry_that_is_turned_is_nothing_else(tmp_path, speed, turn, words):
     assert re.match(words, text), text
 
 
+def test_fixes_that_are_late_beside_a_gyro_are_named(tmp_path):
+    path = turned_drive(tmp_path, lambda t: 10 * np.sin(t / 4).clip(0), 0.0, 400.0) / "log.csv"
+    log = pd.read_csv(path).drop(columns="heading").eval("yaw_rate = 0.01 * speed")
+    write(log.assign(**log[["x", "y"]].shift(50)), path)
+    assert "s behind its odometry" in said(read_log(path))
+
+
 def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     """Whatever the seed of the noise, an error of 1.7 degrees is named, or said to be perhaps one."""
     for seconds in (70, 80, 90):
         log = turned_drive(tmp_path / str(seconds), lambda t: 10 + 4 * np.sin(t / 6), 0.03, seconds)
-        (log / "truth.csv").unlink()
-        result = check(read_log(log, std={"x": 1.0, "y": 1.0}))
+        result = check(read_log(log / "log.csv", std={"x": 1.0, "y": 1.0}))
         every = "\n".join([*result.warnings, *result.unseen])
         assert re.search(r"turned by 1\.|whether an error of 0\.0\d+ \+- 0\.0\d+ \(rad, of the direction", every)
 

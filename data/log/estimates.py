@@ -252,7 +252,8 @@ def odometry(c: Check, column: int) -> Estimate:
         y = moved - driven
         if rec.ids[column] in c.log.summary.assumed.get(COURSE.format("{}", "fixes"), ()):
             along = driven.conj() / abs(driven)  # across, a heading that is derived follows the fixes
-            y, causes, span = (y * along).real + 0j, (causes * along).real + 0j, 0.0 * span
+            shares = (causes * along).real * [[1.0], [0.0], [1.0], [1.0]]  # what rounding leaves of a turn is none
+            y, causes, span = (y * along).real + 0j, shares + 0j, 0.0 * span
         value, error = _of_motion(y, causes, span, 2**0.5 * c.fix_noise)
         attenuation = np.square(norm(noise) * rec.dt / (norm(driven) or 1.0))  # by noise of the cause
         turned = (1 + complex(*value[:2])) * (1 + attenuation)
