@@ -86,7 +86,7 @@ def constant_velocity(
             way, noise = ACCELERATION * dt * dt, CLIP_STDS * sqrt(2.0 * squares / numbers)
             again, beyond[m] = beyond[m], square > limit
             otherwise = again and beyond[m] and inner_product(turned, turned) < (2.0 * way + noise) ** 2
-            doubted = beyond[m] and (otherwise or square < (way + noise) ** 2)
+            doubted = beyond[m] and (otherwise or square < way**2)
             store(x, m, add(at, scale(innovation, clip * a / s)))
             store(u, m, add(vector_at(u, m), scale(innovation, clip * b / s)))
             store(p, m, (a / s, b / s, d - b * b / s))

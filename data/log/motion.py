@@ -35,6 +35,8 @@ MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
 OF_FASTEST = 0.25
 """Share of its largest speed, below which what is slower than that has no course."""
+LASTS = 1.0
+"""s, for which errors of a gyro last beside those that are stated, which are white."""
 SHOWN_STDS = 3.0
 """Standard deviations of a velocity that fixes have shown, above which it is one."""
 STANDS = 0.5
@@ -215,7 +217,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still, still[:, 0])
     std = float(only(rows, "x", "y")["std"].median())
     way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
-    gyro = float(only(rows, "yaw_rate")["std"].median() * turn.interval**0.5)
+    gyro = float(only(rows, "yaw_rate")["std"].median() * (turn.interval + LASTS) ** 0.5)
     if gyro > 0.0:
         way = way._replace(walk=gyro)
     shown, (derived, factor) = velocity_of_fixes(way, steps), heading_of_rates(way, steps.gap(turn.t))

@@ -153,6 +153,7 @@ def without_wild(c: Check) -> Check:
         at = np.flatnonzero(np.isfinite(c.fix[:, column, 0]))
         gap, off = plane(c.fix[at, column]), wild[at, column]
         wild[at[:-1], column] &= ~(off[1:] & ((gap[:-1] * gap[1:].conj()).real > 0))
+        wild[at[:-1], column] &= rec.motion_extra[at[1:], column, 0] < 0.5 * abs(gap[:-1]) ** 2
     if not wild.any():
         return c
     less = replace(rec, gnss=np.where(wild[..., None], nan, rec.gnss))
