@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from logs import bends, drive, fixes, motion, noisy, outliers, ranges, write
-from numpy import nan, pi
+from numpy import arange, cumsum, exp, nan, pi, sin, where
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
@@ -67,7 +67,7 @@ FAULTS: dict[str, tuple[Any, str]] = {
         r"\d\d% of what was logged is not used, mostly \d+ repeated rows .*stamp\.sec without nanosec",
     ),
     "a body twist as vx, vy": (
-        lambda f: f.assign(vx=np.hypot(f["vx"], f["vy"]), vy=0.1 * np.sin(np.arange(len(f))) + 0 * f["vx"]),
+        lambda f: f.assign(vx=np.hypot(f["vx"], f["vy"]), vy=0.1 * sin(arange(len(f))) + 0 * f["vx"]),
         "car0: vx, vy look like a body-frame velocity",
     ),
     "degrees": (lambda f: f.rename(columns={"x": "y", "y": "x"}).eval("x = 1.6 * x"), "car0: axes look swapped"),
@@ -102,9 +102,9 @@ FAULTS: dict[str, tuple[Any, str]] = {
 
 
 def test_hundreds_of_clocks_are_estimated_in_seconds():
-    row, began = np.arange(12000), process_time()
+    row, began = arange(12000), process_time()
     x = np.zeros((12000, 200))
-    x[row, row % 200] = np.sin(row)
+    x[row, row % 200] = sin(row)
     assert_allclose(factors(x.sum(1) + 0.1 * np.cos(row), x, 0.1).value, 1.0, atol=0.1)
     assert process_time() - began < 3.0
 
@@ -124,10 +124,10 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path):
 @pytest.mark.parametrize("truth", [True, False])
 def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path, truth):
     """1.5 m ahead and 0.6 m to the right of a car whose speed changes, with fixes of 0.5 m that come 0.1 s late."""
-    t, arm = 0.02 * np.arange(9000), (1.5, -0.6)
-    ahead, speed = np.exp(2.5j * np.sin(0.1 * t)), 8 + 4 * np.sin(0.21 * t)
+    t, arm = 0.02 * arange(9000), (1.5, -0.6)
+    ahead, speed = exp(2.5j * sin(0.1 * t)), 8 + 4 * sin(0.21 * t)
     position, velocity = (
-        np.c_[part.real, part.imag, 0 * t][:, None] for part in (np.cumsum(0.02 * speed * ahead), speed * ahead)
+        np.c_[part.real, part.imag, 0 * t][:, None] for part in (cumsum(0.02 * speed * ahead), speed * ahead)
     )
     reference = co.Fleet(("car",), t, position, velocity)
     seen = position[:, 0, :2] @ [1, 1j] + complex(*arm) * ahead - 0.1 * speed * ahead
@@ -240,11 +240,11 @@ def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path, known):
 
 def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
     """As receivers do, which give a course to what moves alone: a third of the drive stands."""
-    t = np.round(np.arange(0, 90, 0.2), 1)
+    t = np.round(arange(0, 90, 0.2), 1)
     moves = (t < 30) | (t >= 60)
-    x = np.cumsum(np.where(moves, 1.6, 0.0))
-    frame = pd.DataFrame({"t": t, "vehicle": "car", "x": x, "y": 0.0, "speed": np.where(moves, 8.0, 0.02)})
-    frame["heading"] = np.where(moves, 0.0, nan)
+    x = cumsum(where(moves, 1.6, 0.0))
+    frame = pd.DataFrame({"t": t, "vehicle": "car", "x": x, "y": 0.0, "speed": where(moves, 8.0, 0.02)})
+    frame["heading"] = where(moves, 0.0, nan)
     log = read_log(write(frame, tmp_path / "car.csv"))
     assert np.isfinite(log.recording.gnss[0, :, 0, 0]).all()
     assert not log.summary.refused
@@ -258,7 +258,7 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
 
 def test_fixes_of_what_stands_err_too(tmp_path):
     x, y = default_rng(0).normal(0, 10, (2, 300))
-    frame = pd.DataFrame({"t": np.arange(300), "x": x, "y": y, "vx": 0, "vy": 0})
+    frame = pd.DataFrame({"t": arange(300), "x": x, "y": y, "vx": 0, "vy": 0})
     assert "NIS is" in said(read_log(write(frame, tmp_path / "a.csv")))
     assert "none of which changes" in str(check(read_log(write(frame.assign(x=0, y=0), tmp_path / "a.csv"))).unseen)
 
@@ -289,8 +289,8 @@ def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path):
 def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
     """Closed form: on a circle of radius r to the left an antenna drives one of hypot(r - left, forward), and its own
     course is off by arctan2(forward, r - left)."""
-    t, r, arm = np.round(np.arange(0, 90, 0.1), 1), 30.0, 1.5 + 0.5j
-    ahead = 1j * np.exp(0.2j * t)
+    t, r, arm = np.round(arange(0, 90, 0.1), 1), 30.0, 1.5 + 0.5j
+    ahead = 1j * exp(0.2j * t)
     seen, u = (arm - 1j * r) * ahead, 0.2 * r * ahead
     every = {
         "t": t,
@@ -303,7 +303,7 @@ def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
     }
     frame = pd.DataFrame({**every, "yaw_rate": 0.2})[["t", "x", "y", *filter(None, given.split(","))]]
     file = f"{write(frame, tmp_path / 'car.csv')}?frame={'body' if 'yaw' in given else 'world'}"
-    course = np.exp(1j * np.arctan2(1.5, r - 0.5) * (given in ("", "speed,yaw_rate")))
+    course = exp(1j * np.arctan2(1.5, r - 0.5) * (given in ("", "speed,yaw_rate")))
     for option in ("", "&antenna=1.5/0.5/9", "&antenna=car:1.5/0.5/9"):
         off = bool(option) * arm * course
         rec = load_log(file + option).recording
@@ -316,13 +316,13 @@ def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
 def turned_drive(folder, speed, turn, seconds=120.0):
     """A car that goes round in circles or stops, fixes of 1 m once a second, headings turned by an angle."""
     folder.mkdir(exist_ok=True)
-    rng, t = default_rng(1), np.arange(0, seconds, 0.04)
+    rng, t = default_rng(1), arange(0, seconds, 0.04)
     v = speed(t)
-    heading = np.cumsum(0.01 * v * 0.04)
-    x, y = np.cumsum(v * np.cos(heading)) * 0.04, np.cumsum(v * np.sin(heading)) * 0.04
-    fixed = np.arange(len(t)) % 25 == 0
-    seen = [np.where(fixed, at + rng.normal(0, 1.0, len(t)), nan) for at in (x, y)]
-    odometry = {"speed": v * rng.normal(1, 0.02, len(t)), "heading": np.angle(np.exp(1j * (heading + turn)))}
+    heading = cumsum(0.01 * v * 0.04)
+    x, y = cumsum(v * np.cos(heading)) * 0.04, cumsum(v * sin(heading)) * 0.04
+    fixed = arange(len(t)) % 25 == 0
+    seen = [where(fixed, at + rng.normal(0, 1.0, len(t)), nan) for at in (x, y)]
+    odometry = {"speed": v * rng.normal(1, 0.02, len(t)), "heading": np.angle(exp(1j * (heading + turn)))}
     write(pd.DataFrame({"t": t, "vehicle": "a", "x": seen[0], "y": seen[1], **odometry}), folder / "log.csv")
     write(pd.DataFrame({"t": t, "vehicle": "a", "x": x, "y": y})[::5], folder / "truth.csv")
     return folder
@@ -332,8 +332,8 @@ def turned_drive(folder, speed, turn, seconds=120.0):
     ("speed", "turn", "words"),
     [
         (lambda t: 0 * t + 10, 0.05, r"(?!(.|\n)*behind)(.|\n)*its odometry is turned by 2\."),
-        (lambda t: 10 * np.sin(t * pi / 20).clip(0), 0.05, r"(.|\n)*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
-        (lambda t: 10 + 4 * np.sin(t / 2), pi, r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*$"),
+        (lambda t: 10 * sin(t * pi / 20).clip(0), 0.05, r"(.|\n)*turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg"),
+        (lambda t: 10 + 4 * sin(t / 2), pi, r"(.*\n)?a: fixes move -?1[78]\d deg anticlockwise .*$"),
     ],
 )
 def test_odometry_that_is_turned_is_nothing_else(tmp_path, speed, turn, words):
@@ -347,7 +347,7 @@ def test_odometry_that_is_turned_is_nothing_else(tmp_path, speed, turn, words):
 
 
 def test_fixes_that_are_late_beside_a_gyro_are_named(tmp_path):
-    path = turned_drive(tmp_path, lambda t: 10 * np.sin(t / 4).clip(0), 0.0, 400.0) / "log.csv"
+    path = turned_drive(tmp_path, lambda t: 10 * sin(t / 4).clip(0), 0.0, 400.0) / "log.csv"
     log = pd.read_csv(path).drop(columns="heading").eval("yaw_rate = 0.01 * speed")
     write(log.assign(**log[["x", "y"]].shift(50)), path)
     assert "s behind its odometry" in said(read_log(path))
@@ -356,7 +356,7 @@ def test_fixes_that_are_late_beside_a_gyro_are_named(tmp_path):
 def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     """Whatever the seed of the noise, an error of 1.7 degrees is named, or said to be perhaps one."""
     for seconds in (70, 80, 90):
-        log = turned_drive(tmp_path / str(seconds), lambda t: 10 + 4 * np.sin(t / 6), 0.03, seconds)
+        log = turned_drive(tmp_path / str(seconds), lambda t: 10 + 4 * sin(t / 6), 0.03, seconds)
         result = check(read_log(log / "log.csv", std={"x": 1.0, "y": 1.0}))
         every = "\n".join([*result.warnings, *result.unseen])
         assert re.search(r"turned by 1\.|whether an error of 0\.0\d+ \+- 0\.0\d+ \(rad, of the direction", every)
@@ -373,10 +373,10 @@ def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
 )
 def test_few_fixes_show_what_errs_and_the_option_mends_it(tmp_path, fault, words):
     """Fixes a minute apart, and no truth; between two of them the heading is off."""
-    rng, t = default_rng(3), np.arange(0.0, 900.0)
-    heading, v = 2.5 * np.sin(0.03 * t), 4 + np.sin(0.02 * t)
-    u = v * np.exp(1j * heading) + 0.3 * (fault == "current")
-    x = np.cumsum(u) - 0.5 * u
+    rng, t = default_rng(3), arange(0.0, 900.0)
+    heading, v = 2.5 * sin(0.03 * t), 4 + sin(0.02 * t)
+    u = v * exp(1j * heading) + 0.3 * (fault == "current")
+    x = cumsum(u) - 0.5 * u
     off = 0.2 * (fault == "tunnel") * (t > 600) * (t < 660)
     kind, unit = ("speed_kmh", 3.6) if "km/h" in fault else ("speed", 1.0)
     wheels = unit * v * (1.02 if "wheels" in fault else 1.0), unit * 0.05

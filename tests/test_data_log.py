@@ -9,6 +9,7 @@ import pymap3d
 import pytest
 from conftest import refused
 from logs import NOISE, at, drive, fixes, long, motion, observed, ranges, write
+from numpy import arange, arctan2, array, cos, exp, isfinite, radians, sin
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
@@ -55,13 +56,13 @@ def test_a_recording_comes_back_from_its_rows(tmp_path, suffix):
 @pytest.mark.parametrize("latitude", [48.14, -33.9, 0.0, 89.9])
 def test_degrees_are_metres_by_the_radii_of_curvature(tmp_path, latitude):
     """Closed form: east N cos(lat) dlon and north M dlat of WGS84 (Hofmann-Wellenhof et al. 2008, section 8)."""
-    d, a, e2 = 1e-4 * np.arange(20), 6378137.0, 0.00669437999014
-    frame = {"t": np.arange(20.0), "latitude": latitude + d, "longitude": 11.58 + d, "height": 20.0}
+    d, a, e2 = 1e-4 * arange(20), 6378137.0, 0.00669437999014
+    frame = {"t": arange(20.0), "latitude": latitude + d, "longitude": 11.58 + d, "height": 20.0}
     x, y = read_log(write(pd.DataFrame(frame), tmp_path / "car.csv")).recording.gnss[0, :, 0, :2].T
-    s = np.sin(np.radians(latitude)) ** 2
+    s = sin(radians(latitude)) ** 2
     normal, meridian = a / np.sqrt(1 - e2 * s), a * (1 - e2) / (1 - e2 * s) ** 1.5
-    assert_allclose(y, (meridian + 20) * np.radians(d), rtol=1e-4)
-    assert_allclose(x, (normal + 20) * np.cos(np.radians(latitude + d)) * np.radians(d), rtol=1e-4)
+    assert_allclose(y, (meridian + 20) * radians(d), rtol=1e-4)
+    assert_allclose(x, (normal + 20) * cos(radians(latitude + d)) * radians(d), rtol=1e-4)
 
 
 def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
@@ -69,7 +70,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
     origin = (48.14, 11.58, 520.0)
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, 0].T, *origin)
     frame = pd.DataFrame({"time": fleet.t, "lat": lat, "lon": lon, "alt": h, "speed_kmh": 8 * 3.6, "both": 3.0})
-    frame["yaw"] = (90 - np.degrees(np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]))) % 360
+    frame["yaw"] = (90 - np.degrees(arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]))) % 360
     write(frame, tmp_path / "car7.csv")
     names = {"t": "time", "latitude": "lat", "longitude": "lon", "height": "alt", "compass_deg": "yaw"}
     log = read_log(tmp_path / "car7.csv", columns=names, origin=origin)
@@ -97,7 +98,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
 
 
 def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path):
-    t = np.arange(0, 10, 0.5)
+    t = arange(0, 10, 0.5)
     for name, other, x in zip("ab", "ba", (0.0, 12.0), strict=True):
         seen = {f"range_{other}": 12.0, f"range_{other}_std": 0.2, "range_kept": "yes"}
         write(pd.DataFrame({"t": t, "x": 5 * t + x, "y": 0.0, "vx": 5.0, "vy": 0.0} | seen), tmp_path / f"{name}.csv")
@@ -107,7 +108,7 @@ def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path):
 
 
 def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path):
-    t = np.arange(0, 10, 0.5)
+    t = arange(0, 10, 0.5)
     fixes = pd.DataFrame({"t": t, "vehicle": "car", "x": 5 * t, "y": 0.0, "std": 2.5})
     motion = pd.DataFrame({"t": t, "vehicle": "car", "vx": 5.0, "vy": 0.0})
     (tmp_path / "log").mkdir()
@@ -130,15 +131,15 @@ def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhe
 def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     """The observer turns at 0.5 rad/s and measures a road-side unit between the steps; closed form, there and at the
     step."""
-    t = np.arange(0, 10, 0.1)
+    t = arange(0, 10, 0.1)
     at = t[10:90:5] + 0.04
     heading = 0.3 + 0.5 * np.append(t, at)
-    (x, own), (heading, h) = (np.split(values, [len(t)]) for values in (-6j * np.exp(1j * heading), heading))
+    (x, own), (heading, h) = (np.split(values, [len(t)]) for values in (-6j * exp(1j * heading), heading))
     wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x.real, "y": x.imag, "speed": 3.0, "yaw_rate": 0.5})
-    wide.loc[::50, "heading"] = np.angle(np.exp(1j * heading[::50]))
+    wide.loc[::50, "heading"] = np.angle(exp(1j * heading[::50]))
     azimuth = np.angle(20 + 5j - own)
     radio = pd.DataFrame(
-        {"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": np.degrees(np.angle(np.exp(1j * (azimuth - h))))}
+        {"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": np.degrees(np.angle(exp(1j * (azimuth - h))))}
     )
     (tmp_path / "log").mkdir()
     write(wide, tmp_path / "log" / "car.csv")
@@ -149,7 +150,7 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     assert_allclose(rec.relative[0, :, 1], azimuth, atol=0.01)
     assert_allclose(rec.relative[0, :, 1], np.angle(20 + 5j - x[10:90:5]), atol=2e-4)
     assert np.isnan(rec.relative[0, :, [0, 2]]).all()
-    true = 3 * np.exp(1j * heading)
+    true = 3 * exp(1j * heading)
     assert_allclose(rec.velocity[0, 1:, col] @ [1, 1j, 0], (true[1:] + true[:-1]) / 2, atol=2e-3)
     assert (rec.gnss[0, :, rec.ids.index("rsu")] == [20.0, 5.0, 0.0]).all()
     assert "stands at" in log.summary.vehicles["rsu"]
@@ -158,13 +159,13 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
 def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path):
     """1 Hz fixes 0.03 s beside the steps of 10 Hz odometry: without the motion they were 0.24 m off."""
     fleet = drive(1)
-    u, times = fleet.velocity[:, 0], np.arange(3, 190, 10) * 0.1 + 0.03
+    u, times = fleet.velocity[:, 0], arange(3, 190, 10) * 0.1 + 0.03
     x, y, _ = at(fleet, "car0", times).T
     (tmp_path / "log").mkdir()
     write(pd.DataFrame({"t": fleet.t, "vehicle": "a", "vx": u[:, 0], "vy": u[:, 1]}), tmp_path / "log" / "odometry.csv")
     write(pd.DataFrame({"t": times, "vehicle": "a", "x": x, "y": y}), tmp_path / "log" / "gnss.csv")
     log = read_log(tmp_path / "log")
-    fixed = np.isfinite(log.recording.gnss[0, :, 0, 0])
+    fixed = isfinite(log.recording.gnss[0, :, 0, 0])
     assert np.flatnonzero(fixed).tolist() == list(range(3, 190, 10))
     assert_allclose(log.recording.gnss[0, fixed, 0], fleet.position[fixed, 0], atol=0.01)
     assert log.recording.stretches("a") == ((3, 200),)
@@ -202,10 +203,10 @@ def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path):
     rec, refused = log.recording, log.summary.refused
     absent = np.isnan(rec.velocity[0, :, 2, 0])
     assert np.flatnonzero(absent)[[0, -1]].tolist() == [52, 119]
-    assert not np.isfinite(rec.gnss[0, absent, 2]).any()
+    assert not isfinite(rec.gnss[0, absent, 2]).any()
     assert refused["fixes in gaps of the odometry"][0] == absent.sum()
     one = [why for why in refused if "one of the two is absent" in why]
-    kept = np.isfinite(rec.relative).sum()
+    kept = isfinite(rec.relative).sum()
     assert refused[one[0]][0] + kept == frame["kind"].isin(["range", "azimuth", "inclination"]).sum()
     assert rec.stretches("car2") == ((0, 52), (120, 200))
     assert read_log(tmp_path / "log.csv", max_gap=8.0).recording.stretches("car2") == ((0, 200),)
@@ -215,11 +216,11 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
     """Closed form: eight cars at 10 m/s on bends, headings of 0.05 rad every 0.4 s; NEES is 2 in a plane if consistent,
     and was 43 with the noise of the speeds alone."""
     rng, rows, truth = default_rng(8), [], []
-    t = np.round(np.arange(0, 60, 0.1), 1)
+    t = np.round(arange(0, 60, 0.1), 1)
     for car in range(8):
-        turn = 0.2 * np.sin(0.3 * t + car)
+        turn = 0.2 * sin(0.3 * t + car)
         heading = car + np.cumsum(turn) * 0.1
-        x = np.cumsum(1.0 * np.c_[np.cos(heading - turn / 20), np.sin(heading - turn / 20)], axis=0)
+        x = np.cumsum(1.0 * np.c_[cos(heading - turn / 20), sin(heading - turn / 20)], axis=0)
         for k, now in enumerate(t):
             truth.append((now, f"car{car}", *x[k]))
             rows.append((now, f"car{car}", "speed", 10 + rng.normal(0, 0.1), 0.1))
@@ -227,7 +228,7 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
             rows += [(now, f"car{car}", axis, x[k, i] + rng.normal(0, 1.5), 1.5) for i, axis in enumerate("xy")]
             if k % 4 == 0:
                 angle = heading[k] + rng.normal(0, 0.05)
-                rows.append((now, f"car{car}", "heading", np.arctan2(np.sin(angle), np.cos(angle)), 0.05))
+                rows.append((now, f"car{car}", "heading", arctan2(sin(angle), cos(angle)), 0.05))
     write(pd.DataFrame(rows, columns=["t", "vehicle", "kind", "value", "std"]), tmp_path / "log.csv")
     write(pd.DataFrame(truth, columns=["t", "vehicle", "x", "y"]), tmp_path / "truth.csv")
     log = read_log(tmp_path / "log.csv", truth=tmp_path / "truth.csv")
@@ -237,18 +238,18 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
 
 LATE = 0.04
 """s, behind every step of 0.1 s."""
-MAST = np.array([40.0, 60.0])
+MAST = array([40.0, 60.0])
 
 
 def straight(t):
     """Two cars that pass each other at 25 m/s."""
     here = np.asarray(t, float)
-    return {"east": np.array([15 * here - 100, 0 * here]), "west": np.array([60 - 10 * here, 4 + 0 * here])}
+    return {"east": array([15 * here - 100, 0 * here]), "west": array([60 - 10 * here, 4 + 0 * here])}
 
 
 def circle(t):
     """Place m and heading rad of a car at 6 m/s that turns by 0.5 rad/s."""
-    return np.array([12 * np.sin(0.5 * t), -12 * np.cos(0.5 * t)]), 0.5 * t
+    return array([12 * sin(0.5 * t), -12 * cos(0.5 * t)]), 0.5 * t
 
 
 def read_rows(rows, folder, **options: Any):
@@ -261,7 +262,7 @@ def read_rows(rows, folder, **options: Any):
 def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path, late):
     """Moved by the nearest step alone, ranges were wrong by 1 m."""
     rows: list[tuple[Any, ...]] = [(0.0, "mast", kind, "", MAST[k]) for k, kind in enumerate("xy")]
-    for t in np.round(np.arange(0, 8, 0.1), 1):
+    for t in np.round(arange(0, 8, 0.1), 1):
         at = straight(t)
         for name, speed in (("east", 15.0), ("west", -10.0)):
             rows += [(t, name, kind, "", value) for kind, value in zip("xy", at[name], strict=True)]
@@ -270,15 +271,15 @@ def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path, lat
         for other, place in (("west", then["west"]), ("mast", MAST)):
             gap = place - then["east"]
             rows += [(t + late, "east", "range", other, np.hypot(*gap))]
-            rows += [(t + late, "east", "azimuth", other, np.arctan2(gap[1], gap[0]))]
+            rows += [(t + late, "east", "azimuth", other, arctan2(gap[1], gap[0]))]
     found = read_rows(rows, tmp_path, mutual=False)
     links, place = found.links, found.gnss[0]
     gap = (place[links.step, links.neighbour] - place[links.step, links.observer])[:, :2]
     far = np.hypot(*gap.T) > 12.0  # nearer, fixes would not know the direction
     assert far.sum() > 120
     assert_allclose(found.relative[0, far, 0], np.hypot(*gap[far].T), atol=1e-9)
-    assert_allclose(found.relative[0, far, 1], np.arctan2(gap[far, 1], gap[far, 0]), atol=1e-9)
-    assert np.isfinite(found.relative[0]).all() == (not late)  # of what is too near
+    assert_allclose(found.relative[0, far, 1], arctan2(gap[far, 1], gap[far, 0]), atol=1e-9)
+    assert isfinite(found.relative[0]).all() == (not late)  # of what is too near
     assert not (found.relative[0, :, 0] <= 0).any()
 
 
@@ -288,27 +289,27 @@ def test_bearings_in_body_frames_turn_with_the_car(tmp_path, late):
     rows: list[tuple[Any, ...]] = []
     far = 1e6 * MAST
     rows += [(0.0, "far", kind, "", value) for kind, value in zip("xy", far, strict=True)]
-    for t in np.round(np.arange(0, 6, 0.1), 1):
+    for t in np.round(arange(0, 6, 0.1), 1):
         place, _ = circle(t)
         rows += [(t, "car", "speed", "", 6.0), (t, "car", "yaw_rate", "", 0.5)]
         rows += [(t, "car", kind, "", value) for kind, value in zip("xy", place, strict=True)]
         then, heading = circle(t + late)
-        bearing = np.arctan2(*(far - then)[::-1]) - heading
-        rows.append((t + late, "car", "bearing", "far", np.arctan2(np.sin(bearing), np.cos(bearing))))
+        bearing = arctan2(*(far - then)[::-1]) - heading
+        rows.append((t + late, "car", "bearing", "far", arctan2(sin(bearing), cos(bearing))))
     log = read_rows(rows, tmp_path, frame="body", any_scale=True)
     assert len(log.links) >= 59
     for step, relative in zip(log.links.step, log.relative[0], strict=True):
         place, heading = circle(log.t[step])
-        off = relative[1] - np.arctan2(*(far - place)[::-1]) + heading
-        assert np.arctan2(np.sin(off), np.cos(off)) == pytest.approx(0, abs=1e-4)
+        off = relative[1] - arctan2(*(far - place)[::-1]) + heading
+        assert arctan2(sin(off), cos(off)) == pytest.approx(0, abs=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_mean_over_a_step_is_that_over_its_halves(seed):
     rng = default_rng(seed)
     signal = Signal(np.cumsum(rng.uniform(0.01, 1.0, 9)), rng.uniform(-1e6, 1e6, (9, 1)))
-    halves = step_means(signal, 0.15 * np.arange(-1, 17))[:, 0]
-    whole = step_means(signal, 0.3 * np.arange(9))[:, 0]
+    halves = step_means(signal, 0.15 * arange(-1, 17))[:, 0]
+    whole = step_means(signal, 0.3 * arange(9))[:, 0]
     assert_allclose(whole, (halves[::2] + halves[1::2]) / 2, atol=1e-6, rtol=1e-9)
 
 
@@ -332,7 +333,7 @@ def test_a_radars_range_is_not_known_to_its_partner(tmp_path):
 @pytest.mark.parametrize("std", [3.5, None])
 def test_noisy_fixes_at_a_high_rate_have_no_speed_of_their_own(tmp_path, std):
     """588 m/s from one to the next; of days the speed is one."""
-    t = np.arange(0, 20, 0.01)
+    t = arange(0, 20, 0.01)
     x, y = default_rng(0).normal(0, 3.5, (2, len(t)))
     drive = pd.DataFrame({"t": t, "x": 10 * t + x, "x_std": std, "y": y, "vx": 10.0, "vy": 0.0})
     assert read_log(write(drive, tmp_path / "a.csv")).summary.read["fixes"] == len(t)

@@ -9,7 +9,7 @@ import pandas as pd
 import pymap3d
 import pytest
 from conftest import measured, refused
-from numpy import nan
+from numpy import arange, nan, zeros
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pyarrow.parquet import read_metadata
@@ -179,7 +179,7 @@ def drive(t, **more: object):
 @pytest.mark.parametrize("start", [0.0, 1.7e9])
 def test_a_gap_is_one_whenever_time_starts(tmp_path, start):
     """13 s are missing between 4.9 and 18 s: 130 instants, and every other one is there."""
-    t = start + np.round(np.r_[np.arange(0, 5, 0.1), np.arange(18, 23, 0.1)], 6)
+    t = start + np.round(np.r_[arange(0, 5, 0.1), arange(18, 23, 0.1)], 6)
     drive(t).to_csv(tmp_path / "a.csv")
     fleet = load_fleet(tmp_path / "a.csv", dt=0.1)
     assert (~fleet.present).sum() == 130
@@ -192,7 +192,7 @@ def test_a_gap_is_one_whenever_time_starts(tmp_path, start):
 def test_interpolation_agrees_with_pandas():
     """Independent reference: pandas, with the gaps cut out by hand."""
     t = 1.7e9 + np.array([0.0, 0.1, 0.2, 0.9, 1.0])
-    grid = 1.7e9 + np.arange(0, 1.01, 0.05)
+    grid = 1.7e9 + arange(0, 1.01, 0.05)
     series = pd.Series(np.sin(t - 1.7e9), index=np.round(t - 1.7e9, 3))
     union = series.reindex(np.union1d(series.index, np.round(grid - 1.7e9, 3))).interpolate("index")
     wanted = union.reindex(np.round(grid - 1.7e9, 3)).to_numpy(copy=True)
@@ -201,7 +201,7 @@ def test_interpolation_agrees_with_pandas():
 
 
 def test_degrees_are_not_metres(tmp_path):
-    t = np.arange(0, 5, 0.1)
+    t = arange(0, 5, 0.1)
     drive(t).assign(**{"x": 11.58 + 1e-5 * t, "y": 48.14 + 4e-5 * t}).to_csv(tmp_path / "a.csv")
     with refused(r"columns x, y = 11\.58\.\.11\.58.*look like degrees.*read_log"):
         load_fleet(tmp_path / "a.csv")
@@ -211,13 +211,13 @@ def test_degrees_are_not_metres(tmp_path):
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 @pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
 def test_dates_are_seconds_since_1970(tmp_path, unit, zone):
-    t = pd.to_datetime(1_700_000_000_000 + 100 * np.arange(5), unit="ms").astype(f"datetime64[{unit}]")
+    t = pd.to_datetime(1_700_000_000_000 + 100 * arange(5), unit="ms").astype(f"datetime64[{unit}]")
     stamps = t if zone is None else t.tz_localize("UTC").tz_convert(zone)
-    frame = drive(np.arange(5) / 10).assign(t=stamps)
+    frame = drive(arange(5) / 10).assign(t=stamps)
     frame.to_parquet(tmp_path / "a.parquet", index=False)
     frame.assign(t=[stamp.isoformat() for stamp in stamps]).to_csv(tmp_path / "a.csv")
     for name in ("a.parquet", "a.csv"):
-        assert_allclose(load_fleet(tmp_path / name).t, 1.7e9 + np.arange(5) / 10, atol=1e-6, rtol=0)
+        assert_allclose(load_fleet(tmp_path / name).t, 1.7e9 + arange(5) / 10, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_a_row_that_is_none_is_named(tmp_path, row, message):
 
 
 def test_damaged_tables_are_named(tmp_path):
-    drive(np.arange(50) / 10).to_parquet(tmp_path / "a.parquet")
+    drive(arange(50) / 10).to_parquet(tmp_path / "a.parquet")
     whole = (tmp_path / "a.parquet").read_bytes()
     rng = default_rng(1)
     for _ in range(60):
@@ -253,7 +253,7 @@ def test_damaged_tables_are_named(tmp_path):
 
 def test_what_no_memory_holds_is_refused_at_once(tmp_path):
     began = time.process_time()
-    drive(1e18 + 1e8 * np.arange(5)).to_csv(tmp_path / "a.csv")
+    drive(1e18 + 1e8 * arange(5)).to_csv(tmp_path / "a.csv")
     with refused(r"a\.csv: column t with dt = 0\.1 s = .* steps .*nanoseconds"):
         load_fleet(tmp_path / "a.csv", dt=0.1, any_scale=True)
     (tmp_path / "b.csv").write_text(",".join(["t"] * 100_000) + "\n")
@@ -264,8 +264,8 @@ def test_what_no_memory_holds_is_refused_at_once(tmp_path):
 
 def segment(folder):
     """A minute on a road to the north-east, as comma2k19 stores it; its fixes in degrees and its true places."""
-    t = 5000 + np.arange(0, 60, 0.1)
-    fixes = np.c_[37.7 + 1e-6 * np.arange(600), -122.4 + 1e-6 * np.arange(600), 0 * t + 50.0]
+    t = 5000 + arange(0, 60, 0.1)
+    fixes = np.c_[37.7 + 1e-6 * arange(600), -122.4 + 1e-6 * arange(600), 0 * t + 50.0]
     ecef = np.column_stack(pymap3d.geodetic2ecef(*fixes.T))
     gnss = np.c_[fixes[:, :2], 0 * t + 1.4, 1e3 * t, fixes[:, 2], 0 * t + 38.4]
     for name, array in {
@@ -310,7 +310,7 @@ def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path):
         gps[20:25] = nan
         imu = np.c_[0 * heading, 0 * heading, heading + 0.1, 0 * heading]
         arrays = {"filtered_gps": gps, "filtered_wheel": np.tile([1.1, 1.3], (steps, 1)), "imu_sensor": imu}
-        arrays |= {"theta_gt": heading[:, None], "ground_truth": way, "initial_state": np.zeros(6)}
+        arrays |= {"theta_gt": heading[:, None], "ground_truth": way, "initial_state": zeros(6)}
         drives.append({name: torch.tensor(array) for name, array in arrays.items()} | {"data_date": date})
     torch.save(drives[1:], tmp_path / "test.pt"), torch.save(drives, tmp_path / "val.pt")
     log = co.read_log(tmp_path / "val.pt")
@@ -332,9 +332,9 @@ def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path):
         ("global_pose/frame_positions", b"PK no array", "must be an array of numpy.save"),
         ("processed_log/CAN/speed/value", b"cut", "must be an array of numpy.save"),
         ("processed_log/CAN/speed/value", np.full((600, 1), nan), "not finite"),
-        ("processed_log/CAN/speed/value", np.zeros((600, 2)), r"\(600, 2\): must be \(600, 1\)"),
-        ("processed_log/CAN/speed/t", np.zeros((600, 2)), "as its times"),
-        ("processed_log/CAN/speed/t", np.zeros(0), "must be an array of numpy.save"),
+        ("processed_log/CAN/speed/value", zeros((600, 2)), r"\(600, 2\): must be \(600, 1\)"),
+        ("processed_log/CAN/speed/t", zeros((600, 2)), "as its times"),
+        ("processed_log/CAN/speed/t", zeros(0), "must be an array of numpy.save"),
         ("processed_log/CAN/speed/t", np.float64(3.0), "must be an array of numpy.save"),
         ("processed_log/GNSS/live_gnss_ublox/value", np.array([[{}] * 6], object), "must be an array"),
         ("processed_log/GNSS/live_gnss_ublox/t", np.array(["a"] * 600), "must be an array"),
@@ -359,8 +359,8 @@ def test_a_damaged_array_of_comma2k19_is_named(tmp_path, name, wrong, thing):
 @pytest.mark.parametrize(
     ("x", "lie"),
     [
-        *((x, b"\x82\x00") for x in (np.zeros(200), [[0.0] * 200], ["a" * 2000], ["a" * 900] * 2)),
-        (np.zeros(100), b"\xfe\x7f"),
+        *((x, b"\x82\x00") for x in (zeros(200), [[0.0] * 200], ["a" * 2000], ["a" * 900] * 2)),
+        (zeros(100), b"\xfe\x7f"),
     ],
 )
 def test_a_parquet_table_is_refused_by_its_pages(tmp_path, monkeypatch, x, lie):

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from numpy import nan
+from numpy import eye, full, nan, ones, zeros
 from random_graphs import AB, PAIR
 
 import coopoc as co
@@ -45,8 +45,8 @@ WRONG: tuple[Any, ...] = (
     [None],
     object(),
     b"x",
-    np.ones((2, 2)),
-    np.full(3, nan),
+    ones((2, 2)),
+    full(3, nan),
 )
 """Values of the wrong kind, size or range; some are right for some fields."""
 RAGGED: tuple[Any, ...] = ([[1], [2, 3]], np.datetime64("2024-01-01"), np.array([1, 2], object), 1 + 2j, [10**400] * 4)
@@ -122,9 +122,9 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         (lambda: co.Kalman()(RECORDING, iter([0])), "egos = .*must be a sequence"),
         (lambda: co.Kalman()(RECORDING, {*RECORDING.ids}), "egos = .*must be a sequence"),
         (lambda: co.observe(FLEET, SENSORS, CHANNEL, runs=10**9), r"runs = 1000000000: must be >= 1 and at most \d"),
-        (lambda: co.bound_rt_le(-np.eye(3)[None]), r"trace of cov\[0\] = -3.0: must be >= 0"),
-        (lambda: co.write_tum("x.tum", [0, 1], np.eye(2, 3), [90, 91]), r"heading\[0\] = 90.0: must be in rad"),
-        (lambda: co.Kalman("identity").start().step(np.zeros(3), np.zeros(3), 1e9), r"> 1 ns and at most 1e\+08"),
+        (lambda: co.bound_rt_le(-eye(3)[None]), r"trace of cov\[0\] = -3.0: must be >= 0"),
+        (lambda: co.write_tum("x.tum", [0, 1], eye(2, 3), [90, 91]), r"heading\[0\] = 90.0: must be in rad"),
+        (lambda: co.Kalman("identity").start().step(zeros(3), zeros(3), 1e9), r"> 1 ns and at most 1e\+08"),
     ],
 )
 def test_what_cannot_be_computed_says_why(call, words):
@@ -140,7 +140,7 @@ def test_a_noun_keeps_no_array_that_its_owner_can_change():
     whole[3] = 99.0
     assert fleet.t[3] == 0.3
     assert not RECORDING.links.of(0).flags.writeable
-    graph = replace(PAIR, x0=np.eye(2, 3)).constrain("range", AB, lower=1.0)
+    graph = replace(PAIR, x0=eye(2, 3)).constrain("range", AB, lower=1.0)
     graphs = (graph, *graph.factors, *graph.constraints)
     for noun in (FLEET, RECORDING, TRACK, of_track(TRACK, RECORDING, co.Kalman().message), *graphs):
         for copied in (copy.deepcopy(noun), pickle.loads(pickle.dumps(noun))):
@@ -166,7 +166,7 @@ TOWN = replace(TOWN, heading=true_heading(TOWN))
 SEEN = co.observe(TOWN, SENSORS, CHANNEL, runs=2)
 BODY = co.observe(TOWN, replace(SENSORS, heading_std=0.05), CHANNEL, runs=2, frame="body")
 OWN, POSES = co.Kalman()(SEEN, [0, 1]), co.PoseFilter("solo")(BODY, [0])
-BYTES = co.Ledger(("a",), [9.0], np.ones((2, 1, 1)), np.ones((2, 1, 1)))
+BYTES = co.Ledger(("a",), [9.0], ones((2, 1, 1)), ones((2, 1, 1)))
 NOISE = replace(SENSORS, **dict.fromkeys(ANGULAR, 0.07))
 
 
@@ -175,7 +175,7 @@ def follow(kind, recording, egos, **options: Any):
 
 
 def own(gate, **measured: Any):
-    return co.PoseFilter("solo", assumed=SENSORS, gate=gate).start(0.1, np.zeros(4)).step(co.OwnMeasurement(**measured))
+    return co.PoseFilter("solo", assumed=SENSORS, gate=gate).start(0.1, zeros(4)).step(co.OwnMeasurement(**measured))
 
 
 def solo(x0, interval, history, **step: Any):
@@ -235,11 +235,11 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     **{score.__name__: (score, {"track": POSES, "fleet": TOWN}) for score in (co.heading_error, co.pose_nees)},
     **{bound.__name__: (bound, BOUND) for bound in (co.fleet_bound, co.pose_bound)},
     "posterior_bound": (co.posterior_bound, {**BOUND, "ego": 0, "smoothing": False}),
-    "bound_rt_le": (co.bound_rt_le, {"cov": np.tile(np.eye(3), (4, 1, 1))}),
+    "bound_rt_le": (co.bound_rt_le, {"cov": np.tile(eye(3), (4, 1, 1))}),
     "observe": (co.observe, {**BOUND, "runs": 1, "seed": 0, "observers": [0]}),
     "in_world": (co.in_world, {"recording": BODY}),
     "stars": (lambda **given: list(co.stars(**given)), {"recording": SEEN, "ego": 0, "noise_model": "nominal"}),
-    "paired_difference": (co.paired_difference, {"a": np.ones((3, 2)), "b": np.eye(3)[:, :2]}),
+    "paired_difference": (co.paired_difference, {"a": ones((3, 2)), "b": eye(3)[:, :2]}),
     "NoiseModel": (
         co.NoiseModel,
         {"name": "n", "sensors": SENSORS, "process_std": (1, 1, 1), "gnss_std": (1, 1, 1), "compass": (0.1, 0.1)},
@@ -253,7 +253,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "PoseFilter": (
         partial(follow, co.PoseFilter),
-        {"recording": BODY, "egos": [0], "begin": np.full((4, 4), 0.7), "spread": np.full(4, 0.7), "gate": 5.0},
+        {"recording": BODY, "egos": [0], "begin": full((4, 4), 0.7), "spread": full(4, 0.7), "gate": 5.0},
     ),
     "pose_start": (co.pose_start, {"recording": BODY, "seconds": 3.0, "gate": 5.0}),
     "OwnMeasurement": (own, {**MEASURED, "yaw_rate": 0.7, "heading": 0.7, "gate": 5.0}),
@@ -271,7 +271,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Problem": (least_squares, {"nodes": AB, "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])}),
     "solve": (lambda **given: co.solve(**given).x, {"problem": PAIR, "backend": "gauss-newton"}),
     "incremental": (lambda **given: co.incremental(**given)[0], {"problem": PAIR, "lag": 2, "params": None}),
-    "pose": (co.pose, {"position": np.zeros((4, 2)), "turn": np.full(4, 0.7)}),
+    "pose": (co.pose, {"position": zeros((4, 2)), "turn": full(4, 0.7)}),
     "plot_recording": (partial(drawn, co.plot_recording), {"recording": SEEN, "run": 0, "step": 1}),
     "plot_track": (partial(drawn, co.plot_track), {"track": OWN, "fleet": TOWN, "every": 9}),
     "plot_solution": (partial(drawn, co.plot_solution), {"solution": co.solve(PAIR), "problem": PAIR}),
@@ -378,7 +378,7 @@ def test_solvers_refuse_arguments_of_the_wrong_kind():
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(optimize.loop_closures, {"problem": whole})
     swept(solution.__getitem__, {"point": "a"})
-    swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
+    swept(co.Problem, {"names": ("a",), "x0": zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
     swept(PAIR.add, {"kind": "range", "nodes": AB, "z": 9.0, "std": 1.0, "loss": None})
     swept(PAIR.constrain, {"kind": "range", "nodes": AB, "lower": 1.0, "upper": 9.0})
     swept(co.Problem.from_window, {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None})
@@ -388,10 +388,10 @@ def test_solvers_refuse_arguments_of_the_wrong_kind():
 
 def test_arrays_of_the_wrong_kind_are_refused():
     """NaN is no error there: absent, not measured."""
-    swept(NOISE.velocity_std, {"velocity": np.ones((4, 3)), "floor": 0.1})
-    swept(NOISE.motion_std, {"velocity": np.ones((1, 4, 2, 3)), "interval": 0.1})
+    swept(NOISE.velocity_std, {"velocity": ones((4, 3)), "floor": 0.1})
+    swept(NOISE.motion_std, {"velocity": ones((1, 4, 2, 3)), "interval": 0.1})
     swept(co.NoiseModel.nominal(NOISE).relative_cov, {"relative": SEEN.relative})
-    swept(PAIR.linearise, {"x": np.eye(2, 3)})
+    swept(PAIR.linearise, {"x": eye(2, 3)})
     for law in (co.Loss("huber", 1.0).cost, co.Loss("huber", 1.0).weight):
         swept(law, {"square": 1.0})
 
@@ -411,7 +411,7 @@ def test_a_duration_and_a_mask_are_no_numbers():
     with refused(r"dt = np\.timedelta64"):  # 300 ms are no 300 s
         co.Kalman("identity").start().step([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], np.timedelta64(300, "ms"))  # type: ignore[arg-type]
     with refused("a = dtype object"):  # numbers behind a mask are none
-        co.paired_difference(np.ma.masked_array([1.0, 2.0], [True, False]), np.ones(2))
+        co.paired_difference(np.ma.masked_array([1.0, 2.0], [True, False]), ones(2))
 
 
 def test_training_refuses_values_from_elsewhere():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy import arange
 from numpy.linalg import eigvalsh, inv, solve
 from numpy.random import default_rng
 from scipy.sparse import csc_matrix, triu
@@ -16,11 +17,11 @@ from coopoc.workers import one_thread
 def graph_matrix(seed, nodes, pairs, width):
     """J^T J of a chain of nodes and of random pairs, each with a full block of rows; a prior on the first."""
     rng = default_rng(seed)
-    k = np.arange(nodes - 1)
+    k = arange(nodes - 1)
     ends = np.concatenate([np.c_[k, k + 1], rng.integers(0, nodes, (pairs, 2))])
     J = np.zeros((len(ends) + 1, width, nodes, width))
-    J[np.arange(len(ends)), :, ends[:, 0]] = rng.normal(size=(len(ends), width, width))
-    J[np.arange(len(ends)), :, ends[:, 1]] += rng.normal(size=(len(ends), width, width))
+    J[arange(len(ends)), :, ends[:, 0]] = rng.normal(size=(len(ends), width, width))
+    J[arange(len(ends)), :, ends[:, 1]] += rng.normal(size=(len(ends), width, width))
     J[-1, :, 0] = np.eye(width)
     whole = J.reshape(-1, nodes * width)
     return whole.T @ whole
@@ -41,7 +42,7 @@ def test_it_solves_and_inverts_as_numpy_does(nodes, pairs, width):
     last METIS is asked for an order."""
     A = graph_matrix(nodes + pairs, nodes, pairs, width)
     pattern = upper(A)
-    cholesky = Cholesky(pattern.indptr, pattern.indices, np.repeat(np.arange(nodes), width))
+    cholesky = Cholesky(pattern.indptr, pattern.indices, np.repeat(arange(nodes), width))
     for scale in (1.0, 3.0):  # the second factorisation uses the analysis of the first
         assert cholesky.factor(upper(scale * A).data)
         rhs = default_rng(1).normal(size=len(A))
@@ -64,7 +65,7 @@ def test_parts_that_nothing_joins_are_factored_apart():
     A = np.zeros((30, 30))
     A[:12, :12], A[12:, 12:] = graph_matrix(7, 4, 2, 3), graph_matrix(8, 6, 1, 3)
     order = default_rng(0).permutation(30)
-    pattern, rhs = upper(A[np.ix_(order, order)]), np.arange(30.0)
+    pattern, rhs = upper(A[np.ix_(order, order)]), arange(30.0)
     cholesky = Cholesky(pattern.indptr, pattern.indices)
     assert cholesky.factor(pattern.data)
     assert cholesky.solve(rhs) == pytest.approx(solve(A[np.ix_(order, order)], rhs), rel=1e-8)
@@ -73,7 +74,7 @@ def test_parts_that_nothing_joins_are_factored_apart():
 def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():
     """w columns of a chain hold 2 w numbers in a block of w (w + 3) / 2: at w = 5 half of it is zeros."""
     n = 20
-    parent, begin, rows = np.arange(1, n + 1), np.r_[np.arange(n), n - 1], np.arange(1, n)
+    parent, begin, rows = arange(1, n + 1), np.r_[arange(n), n - 1], arange(1, n)
     parent[-1] = -1
     assert supernodes(parent, begin, rows, np.ones(n, int)).tolist() == [0, 5, 10, 15, 20]
 
@@ -88,7 +89,7 @@ def test_small_matrices_are_factored_by_one_thread(monkeypatch):
 
     monkeypatch.setattr(multifrontal, "factorise", counted)
     with threadpool_limits(2):
-        assert Cholesky(np.arange(151), np.arange(150)).factor(np.ones(150))
+        assert Cholesky(arange(151), arange(150)).factor(np.ones(150))
     assert threads == {1}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import DIMENSIONS, measured, refused
 from hard_graphs import cropped
+from numpy import array, eye, flatnonzero
 from numpy.linalg import eigvalsh, norm
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import moved, random_drive, random_graph, scipys
@@ -30,14 +31,14 @@ from coopoc.optimize.starts.initial import directed
 def test_a_newton_step_promises_the_square_of_its_decrement():
     """Against the dense Hessian by differences of the gradient."""
     problem = from_graph(random_graph(11, steps=8, landmarks=2, ranges=12, seen=8, loops=3), start="file")
-    moving = np.flatnonzero(problem.movable)
+    moving = flatnonzero(problem.movable)
 
     def gradient(v):
         r, J = problem.whiten(moved(problem, problem.x0, v))
         return (J.T @ r)[moving]
 
-    step = 1e-5 * np.eye(len(moving))
-    H = np.array([(gradient(e) - gradient(-e)) / 2e-5 for e in step])
+    step = 1e-5 * eye(len(moving))
+    H = array([(gradient(e) - gradient(-e)) / 2e-5 for e in step])
     g = gradient(np.zeros(len(moving)))
     assert eigvalsh(H).min() > 0
     assert newton_decrease(problem, problem.x0) == pytest.approx(0.5 * g @ np.linalg.solve(H, g), rel=1e-5)
@@ -60,7 +61,7 @@ def test_averages_find_the_truth_whatever_the_odometry_was(dimension):
     assert exact.cost(exact.x0) < 1e4  # landmarks are seen with 0.2 m
     graph = replace(graph, relative_point=PointEdges())
     truth = Space(dimension, has_rotation=True).join(graph.position, graph.rotation)
-    poses = np.flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
+    poses = flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
     assert from_graph(graph, start="tree").x0[poses] == pytest.approx(truth[poses], abs=1e-3)
 
 
@@ -97,7 +98,7 @@ def test_tapes_are_the_formulas(dimension, objective, loss):
     system, x = sparse(problem), problem.x0
     movable = problem.movable.ravel()
     r, J = problem.whiten(x)
-    J = J[:, np.flatnonzero(movable)]
+    J = J[:, flatnonzero(movable)]
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     assert cost == pytest.approx(problem.cost(x), rel=1e-12)
     assert system.cost(x) == pytest.approx(cost, rel=1e-12)
@@ -108,7 +109,7 @@ def test_tapes_are_the_formulas(dimension, objective, loss):
     if loss != "truncated":  # its differences jump at the kink
         exact, h = np.empty_like(dense), 1e-6
         for k in range(system.size):
-            ends = [system.retract(x, sign * h * np.eye(system.size)[k]) for sign in (1.0, -1.0)]
+            ends = [system.retract(x, sign * h * eye(system.size)[k]) for sign in (1.0, -1.0)]
             up, down = ((J.T @ r)[movable] for r, J in map(problem.whiten, ends))
             exact[k] = (up - down) / (2.0 * h)
         exact = 0.5 * (exact + exact.T)
@@ -127,7 +128,7 @@ def test_a_formula_that_casadi_cannot_run_is_refused():
         return (0.5 * np.hypot(float(dx), dy),)
 
     try:
-        problem = Problem([*"ab"], x0=np.eye(2), dimension=2).add("half_range_of_test", ("a", "b"), 1.0, std=0.1)
+        problem = Problem([*"ab"], x0=eye(2), dimension=2).add("half_range_of_test", ("a", "b"), 1.0, std=0.1)
         with refused(r"half_range_of_test.*namespace m"):
             solve(problem)
     finally:
@@ -236,7 +237,7 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken():
     """|v|^2 has a derivative at v = 0; a range whose ends coincide at the start has a direction after a nudge."""
     graph = random_drive(211, steps=70, loops=20)
     a, b, c = 3, 40, 60
-    x0 = np.array(from_graph(graph, start="odometry").x0)
+    x0 = array(from_graph(graph, start="odometry").x0)
     ranges = RangeEdges([[a, b], [b, c]], [0.0, 2.0], [0.01, 0.01])
     together = replace(graph, ranges=ranges, relative_pose=PoseEdges())
     problem = from_graph(replace(graph, ranges=ranges))
@@ -249,7 +250,7 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken():
     assert norm(start[c] - start[b]) > 0
     x0[c, :2] = x0[b, :2]  # far from the origin
     moved = directed(from_graph(together, start="odometry"), x0)
-    assert np.flatnonzero((moved != x0).any(1)).tolist() == [b, c]
+    assert flatnonzero((moved != x0).any(1)).tolist() == [b, c]
     assert 0 < norm((moved[c] - moved[b])[:2]) < 0.5
 
 
@@ -259,9 +260,10 @@ def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():
     assert from_graph(graph).fixed == (0, 40, 80)
     assert found.status is Status.SOLVED
     assert "no measurement joins all parts: A0, B0, C0 are fixed" in str(found.notes)
-    assert from_graph(
-        replace(graph, pose_prior=PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)]))
-    ).fixed == (0, 80)
+    assert from_graph(replace(graph, pose_prior=PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * eye(3)]))).fixed == (
+        0,
+        80,
+    )
     alone = Graph(2, ("A0", "A1"), [True] * 2, [[1.0, 2], [9, 9]], [[0.0], [1.5]])
     assert from_graph(alone).x0[:, :2].tolist() == [[1, 2], [9, 9]]
 
@@ -279,7 +281,7 @@ def test_where_gtsams_optimizer_does_not_arrive_it_is_said():
     """Lengths in micrometres: GTSAM's least damping is one of the unit metre, and its Levenberg-Marquardt creeps.
     Referee: the minimum, which does not depend on the unit."""
     graph = random_drive(216, steps=40, loops=12)
-    edges, scale = graph.relative_pose, np.array([1e6, 1e6, 1.0])
+    edges, scale = graph.relative_pose, array([1e6, 1e6, 1.0])
     small = replace(edges, position=1e6 * edges.position, covariance=edges.covariance * scale[:, None] * scale)
     problem = from_graph(replace(graph, position=1e6 * graph.position, relative_pose=small), "geodesic", "odometry")
     least = solve(from_graph(graph, "geodesic")).cost
@@ -293,7 +295,7 @@ def test_where_gtsams_optimizer_does_not_arrive_it_is_said():
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
 def test_a_measurement_without_variance_is_named(objective):
     graph = random_graph(217, robots=1, steps=20, landmarks=1, ranges=4, seen=0, loops=0)
-    covariance, variance = np.array(graph.relative_pose.covariance), np.array(graph.ranges.variance)
+    covariance, variance = array(graph.relative_pose.covariance), array(graph.ranges.variance)
     covariance[7, 2] = covariance[7, :, 2] = 0.0
     with refused("of A7 and A8: least variance 0"):
         from_graph(replace(graph, relative_pose=replace(graph.relative_pose, covariance=covariance)), objective)
@@ -308,18 +310,18 @@ def test_a_weak_measurement_is_no_free_node(weight):
     the link the second half is free."""
     graph = random_drive(213, steps=100, loops=0)
     edges = graph.relative_pose
-    covariance = np.array(edges.covariance)
+    covariance = array(edges.covariance)
     covariance[49] /= weight**2
     found = solve(from_graph(replace(graph, relative_pose=replace(edges, covariance=covariance))))
     assert found.status is Status.SOLVED
     problem = from_graph(graph)
     nodes = problem.factors[0].nodes
-    keep, factor = np.flatnonzero((nodes != [49, 50]).any(1)), problem.factors[0]
+    keep, factor = flatnonzero((nodes != [49, 50]).any(1)), problem.factors[0]
     cut = Factor(factor.kind, nodes[keep], factor.z[keep], std=factor.std[keep])
     apart = solve(replace(problem, factors=(cut,)), throw=False)
     assert apart.status is Status.RANK_DEFICIENT
     assert set(apart.unobservable) == {f"A{k}" for k in range(50, 100)}
-    ways = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-6]])
+    ways = array([[1.0, 1.0], [1.0, 1.0 + 1e-6]])
     assert all(_seen(csc_array([[1.0, -1.0]]), unit * ways).tolist() == [False, True] for unit in (1.0, 1e-4))
 
 
@@ -387,7 +389,7 @@ def test_acoustic_ranges_of_an_underwater_vehicle_end_where_gtsam_does(name):
         elif kind == "VERTEX_XY":
             values.insert(key(words[0]), gtsam.Point2(*map(float, words[1:3])))
         else:
-            ends, numbers = map(key, words[1:3]), np.array([*map(float, words[3:])])
+            ends, numbers = map(key, words[1:3]), array([*map(float, words[3:])])
             if kind == "EDGE_SE2":
                 noise = gtsam.noiseModel.Gaussian.Covariance(numbers[[[3, 4, 5], [4, 6, 7], [5, 7, 8]]])
                 graph.add(gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*numbers[:3]), noise))

@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from conftest import DESCENTS
+from numpy import array, zeros
 from numpy.linalg import inv, norm
 from numpy.random import default_rng
 from scipy.optimize import least_squares
@@ -26,14 +27,14 @@ def ranged(anchors, start, ranges, std):
 
 
 def test_fixed_nodes_are_at_no_local_minimum():
-    problem = ranged(np.zeros((1, 2)), np.ones(2), np.array([9.0]), 1.0)
+    problem = ranged(zeros((1, 2)), np.ones(2), array([9.0]), 1.0)
     assert "local" not in solve(replace(problem, fixed=(0, 1))).notes[0]
 
 
 @DESCENTS
 @pytest.mark.parametrize(("z", "std"), [(1e308, 1.0), (1.0, 1e-160)])
 def test_an_infinite_cost_is_no_minimum(z, std, backend):
-    problem = ranged(np.zeros((1, 2)), np.ones(2), np.array([z]), std).add("position", "r", [1, 1], 1.0)
+    problem = ranged(zeros((1, 2)), np.ones(2), array([z]), std).add("position", "r", [1, 1], 1.0)
     found = solve(problem, backend, throw=False)
     assert found.status is Status.FAILED
     assert "overflows" in found.notes[-1]
@@ -44,9 +45,9 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     """SciPy's curvature by differences of its own cost is the inverse of the covariance."""
     rng = default_rng(seed)
     angle = rng.uniform(0, np.pi)
-    along = np.array([np.cos(angle), np.sin(angle)])
+    along = array([np.cos(angle), np.sin(angle)])
     anchors, truth = np.outer([0, 10, 25.0], along), along * rng.uniform(2, 20)
-    ranges = norm(anchors - truth, axis=1) + np.array([0.4, -0.4, -0.1])
+    ranges = norm(anchors - truth, axis=1) + array([0.4, -0.4, -0.1])
     problem = ranged(anchors, truth + rng.normal(0, 1, 2), ranges, 0.3)
     found = solve(problem)
     theirs = least_squares(lambda p: (norm(anchors - p, axis=1) - ranges) / 0.3, problem.x0[3], xtol=1e-15)
@@ -55,9 +56,9 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     h, x = 1e-3 * np.eye(2), found.x[3]
     hessian = [[cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b) for a in h] for b in h]
     singular = "J^T J is singular here: the covariance is that of the exact Hessian" in found.notes
-    assert singular == (abs((x - truth) @ np.array([-along[1], along[0]])) < 1e-4)
+    assert singular == (abs((x - truth) @ array([-along[1], along[0]])) < 1e-4)
     if singular:
-        assert found.covariance[3] == pytest.approx(inv(np.array(hessian) / 4e-6), rel=1e-3)
+        assert found.covariance[3] == pytest.approx(inv(array(hessian) / 4e-6), rel=1e-3)
 
 
 @DESCENTS
@@ -65,28 +66,28 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
 @pytest.mark.parametrize("degrees", [0, 20, 45])
 def test_a_strict_minimum_is_one_wherever_the_axes_are(degrees, offset, backend):
     """On the line of its anchors, of ranges that fit there alone: of one precision, and of 1 mm beside 0.5 m."""
-    turn = np.array([[c := np.cos(np.deg2rad(degrees)), s := np.sin(np.deg2rad(degrees))], [-s, c]])
+    turn = array([[c := np.cos(np.deg2rad(degrees)), s := np.sin(np.deg2rad(degrees))], [-s, c]])
     for anchors, start, ranges, std in (
         ([0, 10, 25], [4, 0.7], [3.9, 5.8, 20.75], 0.1),
-        ([0, 4.5], [9, 1e-3], [9.0, 3.7], np.array([[1e-3], [0.5]])),
+        ([0, 4.5], [9, 1e-3], [9.0, 3.7], array([[1e-3], [0.5]])),
     ):
         at = np.outer(anchors, [1.0, 0.0]) @ turn + offset
-        problem = ranged(at, np.array(start) @ turn + offset, np.array(ranges), std)
+        problem = ranged(at, array(start) @ turn + offset, array(ranges), std)
         assert solve(problem, backend, throw=False).status is Status.SOLVED
 
 
-ANCHORS = np.array([[0, 0], [10, 0.0]])
+ANCHORS = array([[0, 0], [10, 0.0]])
 
 
 def test_a_saddle_between_two_anchors_is_one():
     """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line, of 4 and 6 m on it."""
-    problem = ranged(ANCHORS, np.array([5, 0.0]), np.full(2, 15.0), 1.0)
+    problem = ranged(ANCHORS, array([5, 0.0]), np.full(2, 15.0), 1.0)
     found = solve(replace(problem, search=Search(x0=problem.x0)), throw=False)
     assert found.status is Status.SADDLE
     assert "this minimum" not in str(found.notes)
     assert solve(problem).cost < 1e-9
-    assert solve(ranged(ANCHORS, np.array([4, 0.1]), np.array([4.0, 6.0]), 0.1)).status is Status.SOLVED
-    unknown = ranged(np.zeros((1, 2)), np.array([3, 4.0]), np.array([5.0]), 1.0)
+    assert solve(ranged(ANCHORS, array([4, 0.1]), array([4.0, 6.0]), 0.1)).status is Status.SOLVED
+    unknown = ranged(zeros((1, 2)), array([3, 4.0]), array([5.0]), 1.0)
     assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
 
 
@@ -100,7 +101,7 @@ def test_an_end_that_is_no_minimum_says_why(toward, why):
 
 def test_ranges_that_do_not_meet_are_noted():
     """Closed form: ranges of 3 m to anchors 10 m apart are each 2 m off in the middle, and nothing is spare."""
-    found = solve(ranged(ANCHORS, np.array([5, 1.0]), np.full(2, 3.0), 1.0))
+    found = solve(ranged(ANCHORS, array([5, 1.0]), np.full(2, 3.0), 1.0))
     assert found.cost == pytest.approx(4.0)
     assert "explains 0" in found.notes[-1]
 
@@ -113,7 +114,7 @@ def test_odometry_of_micrometres_beside_a_fix_of_a_metre_is_known(std):
 
 
 def test_a_certified_mirror_image_is_not_unique():
-    pair = ranged(ANCHORS, np.array([5, 1.0]), np.array([7, 8.0]), 1.0)
+    pair = ranged(ANCHORS, array([5, 1.0]), array([7, 8.0]), 1.0)
     verdict = certify(pair, solve(pair))
     assert (verdict.certified, verdict.unique) == (True, False)
     assert "mirror image" in str(verdict)
@@ -133,7 +134,7 @@ def test_a_lower_bound_is_below_the_cost(seed):
     rng = default_rng(seed)
     z, u = 1e4 * rng.normal(size=6), rng.normal(size=5)
     s, t = 10.0 ** rng.uniform(-3, 0, 2)
-    fix, chain = np.zeros((6, 3)), np.zeros((5, 3))
+    fix, chain = zeros((6, 3)), zeros((5, 3))
     fix[:, 0], chain[:, 0] = z, u
     problem = Problem(tuple("abcdef")).add("position", list("abcdef"), fix, std=s)
     problem = problem.add("displacement", list(zip("abcde", "bcdef", strict=True)), chain, std=t)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import among, refused
-from numpy import nan
+from numpy import array_equal, nan
 from numpy.linalg import norm
 
 from coopoc import V2X, Fault, Outliers, Sensors, observe
@@ -36,7 +36,7 @@ def test_a_fault_has_the_rate_the_size_and_the_duration_that_it_names(lasts):
     independent = steps * np.tanh(0.5 * dt / lasts) if lasts else steps
     assert abs(uniform.wrong.mean() - 0.2) < 4 * 0.4 / np.sqrt(independent)
     assert uniform.wrong[rare.wrong].all()
-    assert np.array_equal(uniform.size[rare.wrong], rare.size[rare.wrong])
+    assert array_equal(uniform.size[rare.wrong], rare.size[rare.wrong])
     assert abs(uniform.size.mean() - 11.5) < 4 * 17 / np.sqrt(12 * independent)
     assert abs(long.size.mean() - 20.0) < 4 * 17 / np.sqrt(independent)
     assert min(uniform.size.min(), long.size.min()) >= 3
@@ -50,7 +50,7 @@ def test_without_a_rate_nothing_changes_by_a_bit(crossing):
     for frame in ("world", "body"):
         clean, same = (seen(crossing, o, frame=frame) for o in (Outliers(), none))
         for name in ("gnss", "velocity", "relative"):
-            assert np.array_equal(getattr(clean, name), getattr(same, name))
+            assert array_equal(getattr(clean, name), getattr(same, name))
         assert same.notes == ()
 
 
@@ -68,7 +68,7 @@ def test_outliers_are_added_to_the_clean_draws(crossing, frame):
     assert jump[jump > 1e-9].min() + 1e-9 >= 10.0
     assert np.nanmax(jump) < 50.0 + 1e-9
     assert not np.isnan(bad.gnss[:, 0]).any()
-    assert np.array_equal(bad.gnss[:, 0], clean.gnss[:, 0])
+    assert array_equal(bad.gnss[:, 0], clean.gnss[:, 0])
     everywhere = seen(crossing, Outliers(fixes=Fault(1.0, (10.0, 10.0))), frame=frame, runs=20).gnss - clean.gnss
     assert abs(everywhere[:, 1:].mean(axis=(0, 1, 2))).max() < 0.3  # of 10 m in any direction
     assert abs((abs(bad.velocity - clean.velocity).max(-1) > 1e-9).mean() - 0.1) < 0.03
@@ -95,7 +95,7 @@ def test_a_wrong_association_is_the_direction_of_the_nearest_other_vehicle(cross
     )
     hit = abs(wrap(bad.relative[..., 1] - clean.relative[..., 1])) > 1e-6
     assert 0.05 < hit.mean() < 0.12
-    assert np.array_equal(bad.relative[..., 0], clean.relative[..., 0])
+    assert array_equal(bad.relative[..., 0], clean.relative[..., 0])
     direction = to_vector(bad.relative / [1, 1, 1]) / bad.relative[..., :1]
     for run, link in np.argwhere(hit)[::7]:
         t, i, j = (int(side[link]) for side in (bad.links.step, bad.links.observer, bad.links.neighbour))
@@ -122,12 +122,12 @@ def test_draws_are_keyed_by_what_they_belong_to(crossing):
     """30 runs are a prefix of 100, a shorter drive of a longer one, K = 2 of K = 4; and one kind changes no other."""
     base = seen(crossing, runs=5)
     fewer, shorter = seen(crossing, runs=2), seen(crossing.between(0, 30), runs=2)
-    assert np.array_equal(fewer.gnss, base.gnss[:2], equal_nan=True)
-    assert np.array_equal(shorter.gnss, base.gnss[:2, :30], equal_nan=True)
-    assert np.array_equal(shorter.velocity, base.velocity[:2, :30])
+    assert array_equal(fewer.gnss, base.gnss[:2], equal_nan=True)
+    assert array_equal(shorter.gnss, base.gnss[:2, :30], equal_nan=True)
+    assert array_equal(shorter.velocity, base.velocity[:2, :30])
     few = observe(crossing, replace(S2, outliers=ALL), V2X(max_neighbours=2), runs=5)
-    assert np.array_equal(few.relative, base.relative[:, among(base.links, few.links)])
-    assert np.array_equal(seen(crossing, Outliers(ranges=ALL.ranges), runs=5).relative[..., 0], base.relative[..., 0])
+    assert array_equal(few.relative, base.relative[:, among(base.links, few.links)])
+    assert array_equal(seen(crossing, Outliers(ranges=ALL.ranges), runs=5).relative[..., 0], base.relative[..., 0])
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
@@ -137,9 +137,9 @@ def test_what_is_told_is_what_differs_from_the_clean_recording(crossing, frame):
     )
     by_hand = np.where(bad.relative == clean.relative, clean.relative, nan)
     by_hand[..., 2] = np.where(np.isnan(by_hand[..., 1]), nan, by_hand[..., 2])
-    assert np.array_equal(told.relative, by_hand, equal_nan=True)
-    assert np.array_equal(told.gnss, np.where(bad.gnss == clean.gnss, clean.gnss, nan), equal_nan=True)
-    assert np.array_equal(told.velocity, clean.velocity)
+    assert array_equal(told.relative, by_hand, equal_nan=True)
+    assert array_equal(told.gnss, np.where(bad.gnss == clean.gnss, clean.gnss, nan), equal_nan=True)
+    assert array_equal(told.velocity, clean.velocity)
     assert all(note.endswith("removed") for note in told.notes)
 
 

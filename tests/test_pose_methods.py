@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from conftest import refused, with_masts
 from logs import noisy
-from numpy import inf, nan
+from numpy import arange, inf, nan
 from numpy.linalg import inv, norm
 
 import coopoc as co
@@ -23,13 +23,13 @@ WHITE = co.Sensors(
 
 def convoy(vehicles=5, steps=200, masts=0):
     """Vehicles that wind along at 10 m/s, 8 m apart, and masts beside their way."""
-    t = np.arange(steps) * 0.1
-    course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * np.arange(vehicles))
+    t = arange(steps) * 0.1
+    course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * arange(vehicles))
     velocity = 10 * np.stack([np.cos(course), np.sin(course), 0 * course], axis=2)
-    start = np.c_[8.0 * np.arange(vehicles), 3.0 * (np.arange(vehicles) % 2), 0.0 * np.arange(vehicles)]
+    start = np.c_[8.0 * arange(vehicles), 3.0 * (arange(vehicles) % 2), 0.0 * arange(vehicles)]
     position = start + np.cumsum(0.1 * velocity, 0)
     fleet = co.Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, velocity)
-    return with_masts(fleet, np.arange(masts)[:, None] * [60.0, 0.0, 0.0] + [0.0, 12.0, 4.0])
+    return with_masts(fleet, arange(masts)[:, None] * [60.0, 0.0, 0.0] + [0.0, 12.0, 4.0])
 
 
 def observed(fleet, sensors=WHITE, runs=30, **more: Any):
@@ -151,7 +151,7 @@ def test_mistakes_are_named(make, words):
 @pytest.mark.parametrize("wild", [0.0, 0.1])
 def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings, wild):
     """Scale and bias of the odometry, ranges that are all too long, a tenth of them reflected; and the truth."""
-    rng, t, anchors = np.random.default_rng(5), np.arange(0, 60, 0.1), np.array([4 + 5j, -6 + 1j, 2 - 6j])
+    rng, t, anchors = np.random.default_rng(5), arange(0, 60, 0.1), np.array([4 + 5j, -6 + 1j, 2 - 6j])
     truths, tables = [], [pd.DataFrame({"t": 0, "vehicle": list("uvw"), "x": anchors.real, "y": anchors.imag})]
     for k, name in enumerate("abc"):
         turn = 0.15 * (-1) ** k + 0.1 * np.cos(0.1 * t + k)
@@ -176,7 +176,7 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
     track = co.PoseFilter(begin=begin)(rec, own)
     assert co.rt_le(track, log.truth).max() < 0.1
     assert len(track.notes) == 1
-    moved = rec.gnss + 5.0 * (np.arange(len(rec.ids)) == rec.ids.index("u"))[:, None]
+    moved = rec.gnss + 5.0 * (arange(len(rec.ids)) == rec.ids.index("u"))[:, None]
     lost = co.PoseFilter(begin=begin)(replace(rec, gnss=moved), own).notes
     assert any(note.startswith("relative measurements, a and u: far from estimates (") for note in lost)
 
@@ -184,9 +184,9 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
 def test_first_poses_come_from_ranges_alone():
     """Landmarks far from the origin, without fixes and compass; the median was 1.34 m with ranges taken as linear."""
     fleet = convoy(2, masts=5)
-    fleet = replace(fleet, position=fleet.position + np.where(np.arange(7) % 2, 900.0, 920.0)[:, None])
+    fleet = replace(fleet, position=fleet.position + np.where(arange(7) % 2, 900.0, 920.0)[:, None])
     seen = observed(fleet, replace(WHITE, compass=False, gnss_std=(0.0,) * 3), runs=80, assumed=WHITE)
-    relative, fixes = np.where(np.arange(3) == 0, seen.relative, nan), np.array(seen.gnss)
+    relative, fixes = np.where(arange(3) == 0, seen.relative, nan), np.array(seen.gnss)
     fixes[:, :, :2] = nan
     off = co.pose_start(replace(seen, gnss=fixes, relative=relative))[:, :2] - np.c_[fleet.position[0, :2], [0.0, 0.19]]
     assert np.median(norm(off[..., :2], axis=-1)) < 1.2
