@@ -170,7 +170,7 @@ def _status(argv: list[str]) -> int:
         print(f"coopoc: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("coopoc: interrupted. Finished cells are kept: repeat the command to resume.", file=sys.stderr)
+        print("coopoc: interrupted. A study keeps its finished cells: repeat its command to resume.", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of stdout has ended, as in: coopoc table FOLDER | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

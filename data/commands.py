@@ -88,7 +88,7 @@ def _fields(entry: Entry) -> dict[str, str]:
 
 
 def _print(name: str, fields: dict[str, str]) -> None:
-    print("\n".join([name, *(f"  {key:<13}{value}" for key, value in fields.items())]))
+    print("\n".join([name, *(f"  {key:<12} {value}" for key, value in fields.items())]))
 
 
 def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> None:

@@ -98,7 +98,8 @@ def benchmark(
             raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
     failed = 0
     for name in methods:
-        began, file = time.perf_counter(), card_file(name, out, seed, validation)
+        count = len({*tasks} or (by_name if data is None else {}) or runnable(name, by_name, data))
+        began, file = time.perf_counter(), card_file(name, out, seed, validation, count)
         made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
         write(file, json.dumps(made, indent=1) + "\n")

@@ -101,7 +101,7 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
         named_method(name)
     cards = []
     for name in methods:
-        began, file = time.perf_counter(), card_file(name, out, seed, validation)
+        began, file = time.perf_counter(), card_file(name, out, seed, validation, count)
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
         lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in cards[-1].items())
         write(file, "{\n" + ",\n".join(lines) + "\n}\n")  # a card is read by people and kept in a repository
@@ -111,11 +111,20 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
     return int(any(card["failed"] for card in cards))
 
 
-def card_file(name: str, out: Path, seed: int | None, validation: bool) -> Path:
+def card_file(name: str, out: Path, seed: int | None, validation: bool, count: int) -> Path:
     """File of a method's card; in folders of their own those of other draws and of validation, which cannot be
-    submitted."""
+    submitted.
+
+    Raises:
+        InputError: it is there, of more worlds or tasks than the `count` to come.
+    """
     folder = made_folder(out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}"))
-    return folder / f"{quote(name, safe='')}.json"
+    file = folder / f"{quote(name, safe='')}.json"
+    held = json.loads(file.read_bytes()) if file.is_file() else {"tasks": ()}
+    if (had := len(held["tasks"] if "tasks" in held else held["worlds"]["seed"])) > count:
+        hint = "Name another --out, or remove the card."
+        raise InputError("out", str(file), f"holds {had} results already, and {count} would replace them", hint)
+    return file
 
 
 def card_head(name: str) -> Row:
@@ -242,7 +251,9 @@ def details(card: Params) -> str:
     kinds = sorted(card["by_kind"].items(), key=lambda item: -item[1]["worse_than_better"][0])
     table = _table("kind of fault", kinds, "95th percentile")
     lines = [
-        f"{_of(row['ratio'])} ({_of(row['rt_le_m'])} m; {JOINT} {_of(row['joint_m'])} m, {ALONE} "
+        f"failed: {row['text']}\n    {row['command']}"
+        if row["ratio"] is None
+        else f"{_of(row['ratio'])} ({_of(row['rt_le_m'])} m; {JOINT} {_of(row['joint_m'])} m, {ALONE} "
         f"{_of(row['alone_m'])} m): {row['text']}\n    {row['command']}"
         for row in card["worst"]
     ]

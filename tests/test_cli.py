@@ -208,6 +208,6 @@ def test_an_interrupted_run_says_so_and_resumes(tmp_path, jobs):
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert "coopoc: interrupted. Finished cells are kept: repeat the command to resume." in stderr
+    assert "coopoc: interrupted. A study keeps its finished cells: repeat its command to resume." in stderr
     assert "Traceback" not in stderr
     assert 3 <= json.loads(coopoc(*words, "--dry-run", cwd=tmp_path).stdout)["finished"] < 9

@@ -113,7 +113,7 @@ def test_folders_that_cannot_be_shown_are_named(made, tmp_path):
     folder = made[0].parents[1] / "small"
     with refused("different studies"):
         report([folder, folder], tmp_path / "r.html")
-    with refused(r"is a folder\. Name the file"):
+    with refused(r"must be a file that ends in \.html\. Name the file"):
         report([folder], tmp_path)
     with refused(rf"holds no manifest\.json\. Give {folder}"):
         report([folder.parent], tmp_path / "r.html")

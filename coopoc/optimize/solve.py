@@ -113,11 +113,11 @@ def solve(
 def _solved(problem: Problem, backend: Backend, options: Options, covariance: bool) -> Solution:
     """The result of a backend, and its assessment."""
     load(*LIBRARIES)
-    began, earlier = clock(), problem.search.seconds
+    began = clock()
     backend.check(problem, options)
     if has_start := problem.x0 is not None and not np.array_equal(problem.x0, problem.search.x0):  # type: ignore[arg-type]
         problem = problem.replace_unchecked(search=Search(notes=problem.search.notes))
-    problem = started(problem)
+    earlier, problem = problem.search.seconds, started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or f.kind == CONVERTED for f in problem.factors)
     constraints, searching, given = problem.constraints, problem.x0 is None and not whole, start

@@ -45,8 +45,9 @@ def report(
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
     """
     out = given_path(out)
-    if out.is_dir():
-        raise InputError("out", str(out), "is a folder", f"Name the file, such as {out / 'report.html'}.")
+    if out.is_dir() or out.suffix not in (".html", ".htm"):
+        hint = f"Name the file, such as {(out if out.is_dir() else out.parent) / 'report.html'}."
+        raise InputError("out", str(out), "must be a file that ends in .html", hint)
     sections = [_section(given_path(folder)) for folder in listed("folders", folders, "Give a list of folders.")]
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
