@@ -120,7 +120,7 @@ def card_file(name: str, out: Path, seed: int | None, validation: bool, count: i
     """
     folder = made_folder(out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}"))
     file = folder / f"{quote(name, safe='')}.json"
-    held = json.loads(file.read_bytes()) if file.is_file() else {"tasks": ()}
+    held: Params = json.loads(file.read_bytes()) if file.is_file() else {"tasks": ()}
     if (had := len(held["tasks"] if "tasks" in held else held["worlds"]["seed"])) > count:
         hint = "Name another --out, or remove the card."
         raise InputError("out", str(file), f"holds {had} results already, and {count} would replace them", hint)
