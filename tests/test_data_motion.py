@@ -109,7 +109,7 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, nam
     x = path(name)[np.searchsorted(T, t)]
     densities = 10.0 ** arange(-3, 3.1, 0.5)
     best = min(np.sqrt(np.square(filtered(t, z, std, q)[0] - x).sum(1).mean()) for q in densities)
-    for method in FILTERS[: 2 + (name not in ("town", "stops"))]:
+    for method in FILTERS:
         assert error(read, method) < 1.15 * best
     assert "the odometry, which they else follow" not in " ".join(check(read).warnings)
 

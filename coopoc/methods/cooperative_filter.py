@@ -60,6 +60,7 @@ class Priors(NamedTuple):
         fix: factor of the assumed standard deviation of fixes, which err together for a while.
         fix_gate: squared Mahalanobis distance from which the fixes of a step weigh less; 0 if no number is doubted.
         forget: s, in which what innovations have shown of levels is forgotten; 0 for levels that stay.
+        quietest: least logarithm of the level of motions.
     """
 
     heading: float = 0.05
@@ -76,10 +77,11 @@ class Priors(NamedTuple):
     fix: float = 1.0
     fix_gate: float = 16.0
     forget: float = 10.0
+    quietest: float = -2.0
 
 
-NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
-"""Of velocities that fixes have shown."""
+NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, quietest=0.0)
+"""Of velocities that fixes have shown: their noise is that of turns, too, before which all may be quiet."""
 AS_STATED = NO_ODOMETRY._replace(fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
 ON_ROADS = Priors(
@@ -185,7 +187,7 @@ class CooperativeFilter(Checked):
     def __post_init__(self) -> None:
         check_fields(self)
         for name, value in self.priors._asdict().items():
-            least = -inf if name in ("absent", "exact") else 0.0
+            least = -inf if name in ("absent", "exact", "quietest") else 0.0
             number(f"priors.{name}", value, least, allowed=">= 0", hint="Give Priors()._replace(...).")
 
     @property
@@ -346,7 +348,7 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
         absent[3:5][np.array([bias, offset]) > 0.0] = -inf
         bias, offset = bias or priors.compass**2, offset or priors.offset**2
     lasting = own, common, time, white, bias, heading, offset, turn, priors.lasts, ranged, absent, priors.exact
-    judged = priors.slip, GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
+    judged = priors.slip, GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget, priors.quietest
     # whole numbers need no kernel of their own
     numbers: Any = [np.float64(value) for value in (std, least, FORGOTTEN, *lasting, *judged)]
     return Model(*numbers)

@@ -561,7 +561,7 @@ class Oracle:
         self.corrected()
         if g.forget:
             step = np.clip(s.learned / (s.information + PRIOR), -MAX_LEVEL_CHANGE, MAX_LEVEL_CHANGE)
-            before, s.level = s.level, np.clip(s.level + step, MIN_LEVEL, MAX_LEVEL)
+            before, s.level = s.level, np.clip(s.level + step, 5 * [MIN_LEVEL] + [g.quietest], MAX_LEVEL)
             changes, n = np.exp(s.level - before) - 1, self.trusted()
             if len(self.fix_terms(self.ego)) == 1:
                 fixes = (changes[3] + n * changes[4]) / (1 + n)

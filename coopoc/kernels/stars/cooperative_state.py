@@ -96,6 +96,7 @@ class Model(NamedTuple):
         fix_gate: squared Mahalanobis distance of a fix, of the fixes in a message, and of its odometer and velocity; 0
             where nothing is doubted.
         forget: s, in which what innovations have shown of levels is forgotten; 0 for levels that stay.
+        quietest: least logarithm of the level of motions.
     """
 
     std: Floats
@@ -117,6 +118,7 @@ class Model(NamedTuple):
     gate: float
     fix_gate: float
     forget: float
+    quietest: float
 
 
 VEHICLE, INPUT, ORDER, HITS, REJECTED, WHO = 0, 1, 2, 3, 6, 7

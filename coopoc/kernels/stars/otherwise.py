@@ -550,7 +550,7 @@ def adapt(f: Filter, model: Model) -> None:
     for kind in range(KINDS_OF_NUMBERS):
         change = ego[SLOPE + kind] / (ego[INFORMATION + kind] + PRIOR)
         level = ego[LEVEL + kind] + min(max(change, -MAX_LEVEL_CHANGE), MAX_LEVEL_CHANGE)
-        level = min(max(level, MIN_LEVEL), MAX_LEVEL)
+        level = min(max(level, model.quietest if kind == MOTIONS else MIN_LEVEL), MAX_LEVEL)
         changes[kind], ego[LEVEL + kind] = math.exp(level - ego[LEVEL + kind]) - 1.0, level
         ego[SLOPE + kind] = 0.0
         ego[INFORMATION + kind] *= keep
