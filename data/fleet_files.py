@@ -53,7 +53,7 @@ def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
     .parquet or (any other ending) CSV file; numbers come back bit by bit."""
     frame = fleet.to_frame().rename(columns={"vehicle": "id"}).round({"t": 6})[[*NEEDED, *velocity * VELOCITY]]
     frame = frame.sort_values("id", key=lambda ids: ids.map(fleet.ids.index), kind="stable")
-    if path.suffix != ".parquet":
+    if path.suffix.lower() != ".parquet":
         write(path, frame.assign(id=frame["id"].map(spreadsheet)).to_csv(index=False, lineterminator="\n"))
     else:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")

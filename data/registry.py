@@ -190,7 +190,7 @@ def detect(path: Path, columns: Names | None = None) -> str:
     >>> detect(Path("drive.parquet"))
     'table'
     """
-    kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix))
+    kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix.lower()))
     if kind is None:
         raise InputError(
             "data",
@@ -216,8 +216,8 @@ def _real(path: Path, columns: Names | None = None) -> str:
     """Format of measurements, "" for anything else."""
     if (path / "Barcodes.dat").is_file():
         return "mrclam"
-    if path.suffix in MEASURED:
-        return MEASURED[path.suffix]
+    if kind := MEASURED.get(path.suffix.lower()):
+        return kind
     return "log" if not any(path.glob("*.tum")) and is_log(path, columns) else ""
 
 

@@ -177,11 +177,12 @@ def test_each_fix_counts_as_it_is_stated(tmp_path):
         assert off[poor].mean() < 0.7
 
 
-def test_a_vehicle_without_odometry_adds_no_noise_to_that_of_others(tmp_path):
+def test_vehicles_with_and_without_odometry_are_each_as_among_their_like(tmp_path):
     alone = log(tmp_path, "car", 1.5, 10, vx=SPEED * cos(COURSE), vy=SPEED * sin(COURSE), vz=0 * T)[0]
     pd.read_csv(tmp_path / "a.csv", usecols=["t", *"xyz"]).dropna().to_csv(tmp_path / "b.csv")
-    both = co.read_log(tmp_path)
+    both, like = co.read_log(tmp_path), co.read_log(tmp_path / "b.csv").recording
     for method in (*FILTERS, co.BatchSmoother()):
+        assert abs(method(both.recording, ["b"]).x[:, ::10] - method(like).x).mean() < 0.3
         assert_allclose(method(both.recording, ["a"]).x, method(alone.recording, ["a"]).x, atol=1e-6)
     assert not any(text.startswith("b") for text in check(both).warnings)
 

@@ -24,7 +24,7 @@ from coopoc.studies.roads import road_row
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
 
 
-@pytest.mark.parametrize("out", ["fleet.csv", "fleet.parquet"])
+@pytest.mark.parametrize("out", ["fleet.csv", "fleet.PARQUET"])
 @pytest.mark.parametrize("name", ["town10-clients", "town04"])
 def test_tables_come_back_bit_by_bit(tmp_path, name, out):
     fleet = load_fleet(name)

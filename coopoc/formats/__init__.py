@@ -26,7 +26,7 @@ def load_graph(path: str | Path, repair: bool = False) -> Graph:
     Traceback (most recent call last):
     coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o. Rename or convert the file.
     """
-    suffix = given_path(path).suffix
+    suffix = given_path(path).suffix.lower()
     if suffix == ".pyfg":
         return read_pyfg(path)
     if suffix == ".g2o":

@@ -206,17 +206,20 @@ class CooperativeFilter(Checked):
         none. By link, too: whether the neighbour is "trusted", and by how many s its "clock" is ahead.
         """
         noise_model = resolve(self.noise_model, check_recording(recording))
-        priors = priors_of(self, noise_model, recording.measured)
+        priors, of_fixes = (priors_of(self, noise_model, recording.measured, shown) for shown in (False, True))
         velocity = recording.velocity
         if priors.fix_gate:
             recording, noise_model = with_odometry(recording, recording.observing(egos), noise_model, priors.fix)
         extra, noise_model = noise_model.extra, replace(noise_model, extra=None)
-        model, notes = model_of(noise_model, priors), [*noise_model.notes]
-        variance = priors.fix**2 * noise_model.fix_variance(recording)
+        notes = [*noise_model.notes]
+        fix = np.full(len(recording.ids), priors.fix)
+        fix[[*recording.shown]] = of_fixes.fix
+        variance = np.square(fix)[:, None] * noise_model.fix_variance(recording)
         sent = fading_memory(recording.gnss, recording.velocity, variance, recording.dt)
         stated = noise_model.compass[1], noise_model.sensors.range_offset_std if noise_model.sensors else 0.0
 
         def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
+            model = model_of(noise_model, of_fixes if ego in recording.shown else priors)
             inputs, assumed = measurements(recording, ego, inbox), assumptions(recording, noise_model, ego, inbox)
             assumed = assumed._replace(fixes=variance)
             odometry = np.zeros((*velocity.shape[:2], 4))
@@ -231,7 +234,7 @@ class CooperativeFilter(Checked):
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
             if priors.fix_gate and np.isfinite(x).any():
-                notes.extend(otherwise(own_id, deviations, priors.fix, stated))
+                notes.extend(otherwise(own_id, deviations, fix[ego], stated))
             notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
@@ -319,15 +322,16 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     ]
 
 
-def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool) -> Priors:
-    """The method's own, and if they are the usual ones those of real roads where measurements are real; none where no
-    noise is stated that an innovation could exceed."""
+def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool, shown: bool = False) -> Priors:
+    """The method's own, and if they are the usual ones those of real roads where measurements are real, of a vehicle
+    with odometry or one whose velocity fixes have shown; none where no noise is stated that an innovation could
+    exceed."""
     priors, sensors = method.priors, noise_model.sensors
     if sensors is None:
         return AS_STATED
     if measured and priors == Priors():
         on_roads = ON_ROADS if sensors.velocity_std_ratio > 0.0 else STATED  # a ratio is assumed where none is stated
-        priors = NO_ODOMETRY if sensors.velocity_reading == "fixes" else on_roads
+        priors = NO_ODOMETRY if shown else on_roads
     return priors
 
 

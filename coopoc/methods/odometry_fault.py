@@ -53,8 +53,7 @@ def with_odometry(
 
 def faults(recording: Recording, columns: Ints, noise_model: NoiseModel, fix: float = 1.0) -> Floats | None:
     """(R, T, N, 3) what corrects the odometry of some columns where fixes show that it fails: velocities east and north
-    m/s, and by how much the variance of a motion is larger m^2. None where no odometry fails, no noise is stated, or
-    velocities were derived from fixes.
+    m/s, and by how much the variance of a motion is larger m^2. None where no odometry fails or no noise is stated.
 
     Args:
         recording: in the world frame.
@@ -63,11 +62,9 @@ def faults(recording: Recording, columns: Ints, noise_model: NoiseModel, fix: fl
         fix: factor of the standard deviation of fixes.
     """
     sensors = noise_model.sensors
-    if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
+    if sensors is None or noise_model.fleet is not None:
         return None
-    more = recording.motion_extra[:, columns, 0]
-    least = more.min(axis=0)  # usual: fixes alone show the velocity
-    columns = columns[~np.isin(columns, recording.landmarks) & ((least == 0.0) | (np.median(more, axis=0) > least))]
+    columns = np.setdiff1d(columns, recording.landmarks + recording.shown)
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     fresh = new_state(motion_noise(noise_model, recording.dt))
     drives = gnss, velocity, fresh, recording.fix_scale**2 * (fix**2 * noise_model.gnss_variance), columns, recording.dt

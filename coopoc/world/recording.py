@@ -88,6 +88,7 @@ class Recording:
         fix_factor: (T, N) by which the deviation of each fix is larger than `sensors` says; none: all are 1.
         motion_variance: (T, N) m^2/s by which each motion is less certain than `sensors` says, as of a vehicle without
             odometry beside others; none: all are 0.
+        shown: columns of vehicles without odometry, whose velocity is what their fixes have shown.
         tags: (N, 3) m forward, left and up from the position of each vehicle to its antenna, between which ranges are;
             none: all are 0, as those of landmarks must be. Pose filters take them off.
 
@@ -112,6 +113,7 @@ class Recording:
     landmarks: tuple[int, ...] = ()
     fix_factor: Floats = ()  # type: ignore[assignment]
     motion_variance: Floats = ()  # type: ignore[assignment]
+    shown: tuple[int, ...] = ()
     tags: Floats = ()  # type: ignore[assignment]
 
     __reduce__ = remade
@@ -132,7 +134,8 @@ class Recording:
         self.__dict__.update({name: checked(name, getattr(self, name), *shape) for name, shape in shapes.items()})
         self.__dict__["observers"] = tuple(np.asarray(self.observers).tolist())
         check_measurements(self.gnss, self.velocity, self.relative)
-        self.__dict__["landmarks"] = tuple(columns("landmarks", self.landmarks, ids))
+        for name in ("landmarks", "shown"):
+            self.__dict__[name] = tuple(columns(name, getattr(self, name), ids))
         at, moves = (values[:, :, list(self.landmarks)] for values in (self.gnss, self.velocity))
         allowed, hint = "must be one position throughout, with a velocity of 0", "A vehicle is no landmark."
         refuse("landmarks", at, ~(at == at[:1, :1]) | (moves != 0), allowed, hint)
@@ -405,7 +408,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
             f"ranges between tags up to {abs(recording.tags).max():.2g} m from their vehicles are those between "
             'vehicles, as methods of positions take them; a PoseFilter (frame="body") takes off the tags'
         )
-    if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
+    if share := _contradicting(recording):
         sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS_NOTE}")
     return tuple(UNLIKELY + text for text in sentences)
 
@@ -429,7 +432,7 @@ def _contradicting(recording: Recording) -> float:
     rough = abs(np.diff(fixes, 2, axis=0))  # of white noise sqrt(6) times a fix's
     noise = max(np.median(rough[np.isfinite(rough)]) / 2.0 if np.isfinite(rough).any() else 0.0, stated)
     short, long = np.sort([abs(moved), abs(driven)], axis=0)
-    far = (long > LONG_STDS * noise) & (short > noise)
+    far = (long > LONG_STDS * noise) & (short > noise) & ~np.isin(column, recording.shown)
     far &= (newest[:-1] >= 0) & (np.diff(newest, axis=0) > 0) & (gaps == 0)
     apart = far & (abs(moved - driven) > APART_SHARE * (abs(moved) + abs(driven)))
     share = float(apart.sum() / max(far.sum(), 1))

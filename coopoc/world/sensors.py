@@ -149,7 +149,7 @@ TEXTS = {
 
 
 BiasMode = Literal["run", "sample"]
-VelocityReading = Literal["axis", "speed", "fixes"]
+VelocityReading = Literal["axis", "speed"]
 ANGULAR = "azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std", "yaw_rate_bias_std"
 
 
@@ -178,8 +178,7 @@ class Sensors:
     """Velocity noise over true velocity: the paper's 10 % (training) and 15 % (test)."""
     velocity_reading: VelocityReading = "axis"
     """"axis": ratio times each component (default, as in the authors' public code: no noise on an axis with zero
-    velocity). "speed": ratio times the speed, on every axis. "fixes": as "axis", of velocities that fixes have shown,
-    since a log holds no odometry: there is none that could slip or be turned."""
+    velocity). "speed": ratio times the speed, on every axis."""
     velocity_floor: float = 0.05
     """m/s, the least velocity std that a method assumes; it never acts. Without it "axis" is singular."""
     climb_std: float = 0.0

@@ -31,6 +31,7 @@ ARRAYS = (
     "landmarks",
     "fix_factor",
     "motion_variance",
+    "shown",
     "tags",
 )
 LINKS = ("step", "observer", "neighbour")

@@ -45,7 +45,7 @@ from .frames import TOO_WIDE
 from .motion import HOLDS, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
 from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
-from .residuals import Check, Row, filtered, without, without_wild
+from .residuals import Check, Row, filtered, wandered, without, without_wild
 
 WRONG_UNITS = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
@@ -230,7 +230,9 @@ def _noisier(c: Check, column: int) -> str:
     rec = c.world
     path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, 0)
     off = pd.DataFrame((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[[0, 1]].dropna()
-    size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / (c.fix_noise * (6 * np.log(2)) ** 0.5)
+    motion = np.ptp(wandered(rec, column)) / max(len(off), 1)
+    usual = np.log(2) * (6 * c.fix_noise**2 + 2 * motion)
+    size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / usual**0.5
     scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated
     most = scatter.max()
     if len(off) < TENTHS * LEAST_COUNT / 2 or most < CONFIDENT_RATIO * max(1.0, scatter.median()):

@@ -305,8 +305,6 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
         assume(
             f"{floor:.2g} m/s or more as the noise of velocities from fixes, where no velocity or heading was logged"
         )
-        if len(steps.summary.shown) == len(moving):
-            noise["velocity_reading"] = "fixes"
     elif {*MOTION}.isdisjoint(square.index):
         ratio, floor = base.velocity_std_ratio, base.velocity_floor
         assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")

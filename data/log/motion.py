@@ -127,6 +127,7 @@ class Member(NamedTuple):
         moves: (T, 3) m/s, as velocity, in the world; in body frames NaN where no heading is known.
         wander: (T,) m^2/s, by which its position becomes uncertain, as fixes have shown its velocity or direction.
         climbs: m^2/s, as `climbing`, of heights whose velocity was not measured.
+        shown: whether fixes alone have shown its velocity, or its direction without a gyro.
     """
 
     gnss: Floats
@@ -139,6 +140,7 @@ class Member(NamedTuple):
     moves: Floats
     wander: Floats
     climbs: float = 0.0
+    shown: bool = False
 
 
 Members = Mapping[str, Member]
@@ -282,7 +284,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    summary.shown += [name] * (heading.wanders > 0.0 and (by_fixes or turn.size < 2))
+    alone = heading.wanders > 0.0 and (by_fixes or turn.size < 2)
     wander = _wander(heading, moves, steps)
     if by_fixes:  # at first a velocity is less certain than later, all the way to the next fix
         wander = np.maximum(wander, np.ptp(fixes.t) / fixes.size * _before(Signal(fixes.t, shown.std), steps) ** 2)
@@ -290,7 +292,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         np.maximum.at(wander, at[at >= 0], shown.moved[at >= 0] / steps.dt)
     climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
-    return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs)
+    return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs, alone)
 
 
 def climbing(fixes: Signal) -> float:

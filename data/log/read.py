@@ -322,6 +322,7 @@ def _recording(rows: Rows, members: Members, steps: Steps, mutual: bool, sensors
         landmarks=tuple(marks),
         fix_factor=factor,
         motion_variance=uncertain,
+        shown=tuple(np.flatnonzero(stacked(members, "shown"))),
     )
 
 

@@ -12,6 +12,7 @@ from numpy import inf, nan
 from coopoc import InputError, Kalman, PoseFilter, Recording, Track, pose_start
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
+from coopoc.kernels.constant_velocity import ACCELERATION
 from coopoc.world.body_frames import between_origins, in_world
 from coopoc.world.links import spherical, stretches, wrap
 
@@ -80,7 +81,7 @@ class Check:
 
     def shown(self, column: int) -> bool:
         """Whether a velocity is of the fixes, whenever they are."""
-        return self.world.sensors.velocity_reading == "fixes" or self.world.ids[column] in self.log.summary.shown
+        return column in self.world.shown
 
     @property
     def in_body(self) -> bool:
@@ -143,6 +144,12 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:
         return poses, TRUE_POSE_STD, ", from the truth's first poses"
 
 
+def wandered(recording: Recording, column: int) -> Floats:
+    """(T,) m^2, by which its motions are uncertain until each step, as velocities are that fixes have shown."""
+    least = (recording.dt * recording.sensors.velocity_floor) ** 2
+    return np.cumsum(recording.motion_extra[:, column, 0] + least)
+
+
 def without_wild(c: Check) -> Check:
     """The same, less the fixes that are wild, of vehicles whose odometry does not fail."""
     size, rec = dimensions(c.world), c.log.recording
@@ -153,7 +160,8 @@ def without_wild(c: Check) -> Check:
         at = np.flatnonzero(np.isfinite(c.fix[:, column, 0]))
         gap, off = plane(c.fix[at, column]), wild[at, column]
         wild[at[:-1], column] &= ~(off[1:] & ((gap[:-1] * gap[1:].conj()).real > 0))
-        wild[at[:-1], column] &= rec.motion_extra[at[1:], column, 0] < 0.5 * abs(gap[:-1]) ** 2
+        unsure = np.diff(wandered(rec, column)[at]) + c.shown(column) * (ACCELERATION * np.diff(rec.t[at]) ** 2) ** 2
+        wild[at[:-1], column] &= unsure < 0.5 * abs(gap[:-1]) ** 2
     if not wild.any():
         return c
     less = replace(rec, gnss=np.where(wild[..., None], nan, rec.gnss))

@@ -258,7 +258,6 @@ class Summary:
         odometry: s, from one sample of it to the next, 0 where there is none.
         rows: how many numbers were logged.
         logged: vehicle -> kinds, as they are named in its files.
-        shown: vehicles of which fixes alone have shown the velocity, or its direction without a gyro.
         reversed_pairs: observer times members, plus neighbour, of pairs that have only what the other end measured.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
 
@@ -283,7 +282,6 @@ class Summary:
     odometry: float = 0.0
     rows: int = 0
     logged: dict[Any, Any] = field(default_factory=dict)
-    shown: list[str] = field(default_factory=list)
     reversed_pairs: list[int] = field(default_factory=list)
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
