@@ -290,11 +290,13 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
             "yaw_rate_bias_std": RATE_BIAS_STD,
             "velocity_bias_std": VELOCITY_BIAS_STD * ("vy_body" in used),
         }
-    derived, climbs = np.max([(member.heading.unsure, member.climbs) for member in members], 0).tolist()
+    apart = dt * _apart(rows, ["bearing"], dt)
+    errors = [(m.heading.unsure * max(1.0, m.heading.lasts / apart) ** 0.5, m.climbs) for m in members]
+    derived, climbs = np.max(errors, axis=0).tolist()
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of(HEADING_STD, "rad", "heading")
     elif derived and "bearing" in used:
-        noise["heading_std"] = derived
+        noise["heading_std"] = derived = min(derived, DEGREES_STD)
         assume(f"{derived:.2g} rad as the noise of derived headings, which rotate bearings")
     if climbs > 0.0:
         noise["climb_std"] = np.sqrt(climbs / dt)

@@ -61,6 +61,7 @@ class Course(NamedTuple):
         wanders: m^2/s, by which a position that is predicted with it becomes uncertain.
         of_pace: function from times to m^2/s at 1 m/s, the same of a direction that errs: times the speed to the 4/3.
         unsure: rad, standard deviation of a heading that was derived.
+        lasts: s, for which its errors are alike.
         shown: (M,) s, when fixes have shown it, where nothing else turns it until they do again.
         bends: rad/m, root mean square of how it turns on the way.
     """
@@ -70,6 +71,7 @@ class Course(NamedTuple):
     wanders: float = 0.0
     of_pace: HeadingAt = np.zeros_like
     unsure: float = 0.0
+    lasts: float = 0.0
     shown: Floats = np.empty(0)
     bends: float = 0.0
 
@@ -172,7 +174,8 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
         rise: Floats = np.nan_to_num(4.0 * noise * held(square, times) ** 2) ** (1 / 3)
         return rise
 
-    return Course(at, "fixes", of_pace=of_pace, unsure=float(np.sqrt(np.median(variance[known])))), factor
+    usual = float(np.median(variance[known]))  # of a steady filter, whose error has this time constant
+    return Course(at, "fixes", of_pace=of_pace, unsure=usual**0.5, lasts=usual / way.walk**2), factor
 
 
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:

@@ -392,7 +392,8 @@ def _heading(
             bends = norm(wrap(np.diff(course))) / (norm(pace[moving][1:] * np.diff(t)) + MOVING)
             courses, std = heading_until(Signal(t, course[:, None]), rate), unsure[moving] / pace[moving]
             shown_at = t[: len(t) * (rate is None)]
-            return Course(courses, source, wanders, np.zeros_like, float(np.median(std)), shown_at, float(bends))
+            usual, turning = float(np.median(std)), float(bends)
+            return Course(courses, source, wanders, np.zeros_like, usual, velocity.interval, shown_at, turning)
     return Course()
 
 
