@@ -164,6 +164,17 @@ def number(
     return result
 
 
+def whole(field: str, value: object, low: int = 0, high: int = 2**63 - 1, hint: str = "Give a whole number.") -> int:
+    """`value` as a Python int in [low, high], see `number`.
+
+    >>> whole("run", 3, 0, 2)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: run = 3: must be in 0..2. Give a whole number.
+    """
+    allowed = f"in {low}..{high}" if high < 2**62 else f">= {low}"
+    return int(number(field, value, low, high, kind=int, allowed=allowed, hint=hint))
+
+
 def runs_in_memory(runs: object, per_run: int) -> int:
     """A number of runs whose recording takes no more than half of the memory of this machine.
 
@@ -173,17 +184,16 @@ def runs_in_memory(runs: object, per_run: int) -> int:
 
     >>> runs_in_memory(10**15, 1000)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
-    coopoc.errors.InputError: runs = 1000000000000000: must be >= 1 and at most ...
+    coopoc.errors.InputError: runs = 1000000000000000: must be in 1.. ...
     """
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
     hint = "A recording must fit into memory: make several of fewer runs, each with its seed, or take fewer vehicles."
-    return int(number("runs", runs, 1, memory // (16 * max(per_run, 1)), kind=int, allowed=">= 1", hint=hint))
+    return whole("runs", runs, 1, memory // (16 * max(per_run, 1)), hint)
 
 
 def seed_of(value: object) -> int:
     """A seed of random draws."""
-    hint = "Any whole number from 0 on will do."
-    return int(number("seed", value, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint))
+    return whole("seed", value, hint="Any whole number from 0 on will do.")
 
 
 def extent(field: str, value: Any, hint: str = "Give (low, high).") -> tuple[float, float]:

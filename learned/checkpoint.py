@@ -13,7 +13,7 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from coopoc import paths
-from coopoc.arrays import check_fields, instance, named, number
+from coopoc.arrays import check_fields, instance, named, whole
 from coopoc.errors import InputError, shown
 from coopoc.formats.seals import UNSEALED, holds, sealed
 from coopoc.paths import given_path
@@ -46,8 +46,8 @@ class Checkpoint:
     def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""
         rows = () if self.history is None else self.history
-        allowed, hint = f"in 0..{len(rows) - 1}", "This checkpoint holds no more weights."
-        return unflatten(rows[number("row", row, 0, len(rows) - 1, kind=int, allowed=allowed, hint=hint)], self.model)
+        kept = whole("row", row, 0, len(rows) - 1, "This checkpoint holds no more weights.")
+        return unflatten(rows[kept], self.model)
 
     def kept(self, row: int) -> int:
         """Row up to `row` whose weights are kept by a training that ended there (`federation.history.selected`)."""

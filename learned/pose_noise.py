@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from coopoc import Fleet, InputError, PoseFilter, Recording, Sensors, Track, pose_nees
-from coopoc.arrays import Floats, number
+from coopoc.arrays import Floats, whole
 from coopoc.evaluate.metrics import pose_covariance
 from coopoc.world.sensors import ANGULAR
 
@@ -67,7 +67,7 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
     """
     if not tasks:
         raise InputError("tasks", 0, "must be one or more", "Give drives with their truth.")
-    evaluations = number("evaluations", evaluations, 1, kind=int, allowed=">= 1", hint="150 are some minutes.")
+    evaluations = whole("evaluations", evaluations, 1, hint="150 are some minutes.")
     names = [name for name in LEARNABLE.split() if getattr(start, name) > 0]
     first = np.log([getattr(start, name) for name in names])
 

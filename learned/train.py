@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from coopoc import InputError
-from coopoc.arrays import listed, number
+from coopoc.arrays import listed, whole
 from coopoc.paths import given_path, made_folder
 from coopoc.plugins import in_file
 from coopoc.workers import leave_with
@@ -72,7 +72,7 @@ def train_all(
         InputError: an unknown recipe; a log without a truth; a net that is worse than `worst`.
     """
     fleet, out = drives_of(data), given_path(out)
-    jobs = number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1")
+    jobs = whole("jobs", jobs, 1, 10**4)
     arguments = {
         "seeds": seeds,
         "starts": starts,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopoc import V2X, PoseFilter, Sensors, Study, heading_error, pose_nees
-from coopoc.arrays import Floats, number, one_of
+from coopoc.arrays import Floats, one_of, whole
 from coopoc.data.log.residuals import GATE_STDS
 from coopoc.data.source import split, while_unchanged
 from coopoc.evaluate.metrics import errors, fix_innovations
@@ -81,7 +81,7 @@ def key(p: Params) -> dict[str, str]:
     source = drives.source(p["data"])
     source.check(drives.calibrated(p))
     channel(p), drives.block(p), drives.driven(p)
-    number("landmarks", p["landmarks"], kind=int, allowed=">= 0")
+    whole("landmarks", p["landmarks"])
     return {"code": revision(*CODE), **source.digests}
 
 

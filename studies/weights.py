@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from coopoc import V2X, InputError, Sensors, observe
-from coopoc.arrays import number
+from coopoc.arrays import whole
 from coopoc.data.source import while_unchanged
 from coopoc.errors import unknown
 from coopoc.plugins import find, from_file, in_file
@@ -36,8 +36,7 @@ WORST_RATIO = 1.1
 
 def seeds(p: Params) -> range:
     """Training seeds of a study with a trained method."""
-    allowed = ">= 1 for a trained method"
-    return range(number("train_seeds", p["train_seeds"], 1, 1000, kind=int, allowed=allowed, hint="Each trains once."))
+    return range(whole("train_seeds", p["train_seeds"], 1, 1000, "Each trains a method once."))
 
 
 def trainable(p: Params) -> bool:

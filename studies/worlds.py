@@ -10,7 +10,7 @@ import numpy as np
 from numpy import pi
 
 from coopoc import V2X, Fleet, Recording, Sensors, load_fleet, observe
-from coopoc.arrays import Floats, number, one_of
+from coopoc.arrays import Floats, one_of, whole
 from coopoc.world.body_frames import turned
 
 from .world_faults import EGOS, KINDS, OF_MOTION, OF_NEIGHBOURS, RUNS, WEIGHTS, Draws, Scene, log_uniform
@@ -60,7 +60,7 @@ def world(seed: int, split: Split = "test", *, without: Collection[str] = (), ev
     >>> found.recording.runs, len(found.egos)
     (4, 2)
     """
-    seed = number("seed", seed, 0, 2**30, kind=int, allowed="in 0..2^30", hint="Count worlds from 0.")
+    seed = whole("seed", seed, 0, 2**30, "Count worlds from 0.")
     key = 3 * seed + SPLITS.index(one_of("split", split, Split))
     for kind in without:
         one_of("without", kind, KINDS)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import special
 
 from coopoc import InputError, Method, nees, rt_le
-from coopoc.arrays import number
+from coopoc.arrays import whole
 from coopoc.evaluate.statistics import WORSE_RATIO, mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.paths import made_folder, write
@@ -94,9 +94,9 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
     Raises:
         InputError: an unknown method, less than one world or process.
     """
-    number("worlds", count, 1, 2**20, kind=int, allowed=">= 1", hint="Cards that are submitted have 1000.")
-    number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
-    first = number("seed", seed or 0, 0, 2**29, kind=int, allowed="in 0..2^29", hint="Count worlds from 0.")
+    whole("worlds", count, 1, 2**20, "Cards that are submitted have 1000.")
+    whole("jobs", jobs, 1, 10**4, "Give the number of worker processes.")
+    first = whole("seed", seed or 0, 0, 2**29, "Count worlds from 0.")
     for name in methods:
         named_method(name)
     cards = []

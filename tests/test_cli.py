@@ -63,7 +63,7 @@ MISTAKES = (
     ),
     ("run small --set runs", "--set = 'runs': must be key=value"),
     ("run small --set rums=3", "Did you mean runs?"),
-    ("run small --jobs 0", "jobs = 0: must be >= 1"),
+    ("run small --jobs 0", "jobs = 0: must be in 1..10000"),
     ("run small --data town10 --set data=town04", "gives data twice"),
     ("benchmark kalman --out /dev/null", "out = /dev/null: cannot be made"),
     ("run error_cdf --tracks tum", "tracks = error_cdf: has cells without estimates"),

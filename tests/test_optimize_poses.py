@@ -134,7 +134,7 @@ WRONG = {
     "not symmetric": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [0, 9]]), "not symmetric"),
     "no dt": (lambda: PLANE.add("speed", AB, 10.0, std=0.1), "1 finite numbers for speed"),
     "held nowhere": (lambda: Problem([*"a"], fixed=[*"a"]), "needs an x0"),
-    "four dimensions": (lambda: Problem([*"a"], dimension=4), "must be 2 or 3"),
+    "four dimensions": (lambda: Problem([*"a"], dimension=4), "must be in 2..3"),
 }
 
 

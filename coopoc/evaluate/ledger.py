@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Floats, check_arrays, checked, number, one_of, refuse, remade, texts
+from ..arrays import Floats, check_arrays, checked, one_of, refuse, remade, texts, whole
 from ..errors import InputError
 from ..methods.track import Track, of_recording
 from ..text import short_repr
@@ -101,7 +101,7 @@ def of_training(
     >>> ledger.per_vehicle(), ledger.per_vehicle("on air")
     (120.0, 140.0)
     """
-    overhead = number("overhead", overhead, 0, 10**9, kind=int, allowed=">= 0 bytes")
+    overhead = whole("overhead", overhead, 0, 10**9, "Give bytes.")
     count = (len(names),)
     payload = np.array([checked("sent", sent, "(V,)", count), checked("received", received, "(V,)", count)])
     moved = np.stack([payload, payload + overhead * checked("messages", messages)], 1)[:, :, None]

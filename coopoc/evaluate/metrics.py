@@ -7,7 +7,7 @@ from numpy import errstate, nan
 from numpy.linalg import eigvalsh, norm, solve
 from scipy import special
 
-from ..arrays import Floats, checked, instance, number, refuse
+from ..arrays import Floats, checked, instance, refuse, whole
 from ..errors import InputError
 from ..kernels.covariances import normalised
 from ..methods.track import UNSOUND, Track, of_recording
@@ -111,7 +111,7 @@ def nees_band(runs: int, degrees: int = 3) -> tuple[float, float]:
     >>> [round(b, 2) for b in nees_band(30)]
     [1.97, 4.28]
     """
-    runs = number("runs", runs, 1, kind=int, allowed=">= 1", hint="Give the number of runs averaged.")
+    runs = whole("runs", runs, 1, hint="Give the number of runs averaged.")
     low, high = special.chdtri(degrees * runs, [0.995, 0.005]) / runs
     return float(low), float(high)
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import Floats, instance, number
+from ..arrays import Floats, instance, whole
 from ..errors import InputError, shown
 from ..methods.track import Track
 from ..text import picture
@@ -45,8 +45,8 @@ def plot_recording(recording: Recording, ax: "Axes | None" = None, *, run: int =
     'East [m]'
     """
     runs, last = instance("recording", recording, Recording).runs, len(recording.t) - 1
-    run = number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}")
-    step = number("step", last // 2 if step is None else step, 0, last, kind=int, allowed=f"in 0..{last}")
+    run = whole("run", run, 0, runs - 1)
+    step = whole("step", last // 2 if step is None else step, 0, last)
     ax, fixes, few = axes(ax), recording.gnss[run, :, :, :2], len(recording.ids) <= len(COLORS)
     for k, name in enumerate(recording.ids):
         color = COLORS[k % len(COLORS)]
@@ -79,8 +79,8 @@ def plot_track(
     2
     """
     last = len(instance("track", track, Track).x) - 1
-    run = number("run", run, 0, last, kind=int, allowed=f"in 0..{last}")
-    every = number("every", max(len(track.t) // 40, 1) if every is None else every, 1, kind=int, allowed=">= 1 step")
+    run = whole("run", run, 0, last)
+    every = whole("every", max(len(track.t) // 40, 1) if every is None else every, 1)
     if fleet is not None:
         same_drive(instance("fleet", fleet, Fleet), (track.ids or fleet.ids)[: len(fleet.ids)], track.t)
     ax, few = axes(ax), len(track.egos) <= len(COLORS)

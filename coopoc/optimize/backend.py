@@ -7,7 +7,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
-from ..arrays import TINY, Floats, instance, number
+from ..arrays import TINY, Floats, instance, number, whole
 from ..errors import InputError, MissingLibraryError, dependencies, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
@@ -101,7 +101,7 @@ class Backend:
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
         most, tolerance = options.get("max_iterations", MAX_ITERATIONS), options.get("tolerance", SOLVER_STEP_TOLERANCE)
         if options:
-            number("max_iterations", most, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
+            whole("max_iterations", most, hint="Leave it out for 500.")
             number("tolerance", tolerance, TINY, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Floats, checked, instance, named, number
+from ..arrays import Floats, checked, instance, named, whole
 from ..errors import InputError, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
@@ -268,5 +268,5 @@ def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Increment
         hint = "Leave them out, or solve() with them."
         raise InputError("problem", f"with {len(problem.constraints)} constraints", "must have none", hint)
     params = instance("params", gtsam.ISAM2Params() if params is None else params, gtsam.ISAM2Params)
-    number("lag", lag, 0, kind=int, allowed="a whole number >= 0", hint="0 forgets nothing.")
+    whole("lag", lag, hint="0 forgets nothing.")
     return Incremental(problem, gtsam.IncrementalFixedLagSmoother(lag, params) if lag else gtsam.ISAM2(params), lag)

@@ -19,7 +19,7 @@ from joblib.externals.loky import process_executor
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 from threadpoolctl import threadpool_limits
 
-from ..arrays import instance, listed, named, number
+from ..arrays import instance, listed, named, whole
 from ..errors import InputError
 from ..formats.trajectories import write_tum
 from ..paths import given_path
@@ -155,7 +155,7 @@ def run_study(
         WorkerDiedError: a worker process was killed, mostly for want of memory; finished cells are kept.
     """
     study, cells, folder = _resolve(study, out, settings)
-    number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
+    whole("jobs", jobs, 1, 10**4, "Give the number of worker processes.")
     params = {cell.name: dict(cell.params) for cell in cells}
     manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, environment())
     with locked(folder, manifest):

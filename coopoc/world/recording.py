@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import TINY, Bools, Floats, Ints, checked, instance, last_true, number, plain, refuse, remade, texts
+from ..arrays import TINY, Bools, Floats, Ints, checked, instance, last_true, plain, refuse, remade, texts, whole
 from ..errors import InputError
 from ..text import short_repr
 from .fleet import check_steps, clock, columns, interval, names
@@ -262,7 +262,7 @@ class Recording:
         ((0, 3),)
         """
         (col,) = columns("vehicle", [vehicle], self.ids)
-        least, every = number("shortest", shortest, kind=int), not instance("fixed", fixed, bool)
+        least, every = whole("shortest", shortest), not instance("fixed", fixed, bool)
         has_fix = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | every
         has_fix[: instance("known", known, bool)] = True
         there = self.present[:, col]

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import AnyArray, check_fields, checked, number
+from ..arrays import AnyArray, check_fields, checked, whole
 
 Schedule = Literal["nearest", "round robin"]
 
@@ -126,7 +126,7 @@ class Message:
             overhead: bytes per message on air.
             neighbours: of the sender, a number or an array.
         """
-        overhead, counts = number("overhead", overhead, kind=int), checked("neighbours", neighbours, dtype=int)
+        overhead, counts = whole("overhead", overhead), checked("neighbours", neighbours, dtype=int)
         return self.rounds * (self.payload + 4 * self.per_neighbour * counts + overhead)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from coopoc import Ledger
-from coopoc.arrays import Floats, instance, number
+from coopoc.arrays import Floats, instance, whole
 from coopoc.evaluate.ledger import of_training
 from coopoc.text import short_repr
 
@@ -128,7 +128,7 @@ class Federation:
     def after(self, rounds: int) -> Gain:
         """The global net after so many rounds, 0 being the start."""
         last = len(self.history) - 1
-        rounds = number("rounds", rounds, 0, last, kind=int, allowed=f"in 0..{last}", hint="See history.")
+        rounds = whole("rounds", rounds, 0, last, "See history.")
         return unflatten(self.history[rounds].weights, self.like)
 
 

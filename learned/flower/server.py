@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from coopoc import InputError, arrays
-from coopoc.arrays import one_of
+from coopoc import InputError
+from coopoc.arrays import one_of, whole
 from coopoc.paths import given_path
 from coopoc.text import visible
 
@@ -86,9 +86,7 @@ def configured(grid: "Grid", context: "Context") -> None:
     """
     run_config: Any = context.run_config
     job, began, rows, names = job_of(run_config), time.perf_counter(), list[Row](), dict[int, str]()
-    nodes = arrays.number(
-        "nodes", run_config["nodes"], 1, 10**6, kind=int, allowed=">= 1", hint="Of clients, to wait for."
-    )
+    nodes = whole("nodes", run_config["nodes"], 1, 10**6, "Of clients, to wait for.")
     out = given_path(run_config["out"])
     if type(untrained(job)).calibrate is not Gain.calibrate:
         allowed = "must be a net that needs no calibration on the clients' segments"

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from coopoc import Method
-from coopoc.arrays import Floats, number
+from coopoc.arrays import Floats, whole
 
 from ..engine.backward import Moments, Outcome, Update, advance
 from ..method import LearnedGain
@@ -138,7 +138,7 @@ def size(field: str, value: object) -> int:
     >>> size("hidden", 8)
     8
     """
-    return int(number(field, value, 1, 1024, kind=int, allowed="in 1..1024", hint="The shipped nets have 5 to 40."))
+    return whole(field, value, 1, 1024, "The shipped nets have 5 to 40.")
 
 
 @cache

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
-from coopoc.arrays import TINY, AnyArray, Floats, check_fields, instance, number, one_of
+from coopoc.arrays import TINY, AnyArray, Floats, check_fields, instance, number, one_of, whole
 from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
@@ -211,7 +211,7 @@ def clients(
 
 def check_pieces(piece: int, split: float) -> None:
     """InputError unless drives can be cut into pieces so long, of which this share trains."""
-    number("piece", piece, 2, 2**31, kind=int, allowed=">= 2 steps", hint="The paper has 100.")
+    whole("piece", piece, 2, hint="The paper has 100 steps.")
     number("split", split, TINY, np.nextafter(1.0, 0.0), allowed="in (0, 1)", hint="The paper has 0.8.")
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, instance, number, one_of
+from ...arrays import Bools, Floats, instance, one_of, whole
 from ...errors import InputError, unknown
 from ...plugins import find, in_file, names
 from ...world.links import spherical as to_spherical
@@ -130,12 +130,12 @@ def measurement(
     instance("name", name, str, 'Give the kind of its factors, such as "range".')
     one_of("frame", frame, Frame)
     hint = 'The formula gets one vector x, y, z; frame="nodes" gives it up to nine nodes.'
-    number("arity", arity, 1, 9 if frame == "nodes" else 2, kind=int, allowed="1 (a node) or 2 (a pair)", hint=hint)
+    whole("arity", arity, 1, 9 if frame == "nodes" else 2, hint)
     entries = components if isinstance(components, tuple | list) else ()
     if not entries or not all(isinstance(component, str) and component in get_args(Component) for component in entries):
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
-    constants = number("constants", constants, 0, kind=int, allowed=">= 0", hint="How many numbers each one carries.")
+    constants = whole("constants", constants, hint="How many numbers each one carries.")
     if instance("linear", linear, bool) and (tuple(components) != ("coordinate",) * 3 or frame != "world"):
         raise InputError(
             "linear", linear, "means that the formula is the vector itself, in the world frame", "Leave it out."

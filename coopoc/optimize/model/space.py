@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Floats, check_turns, checked, number, refuse
+from ...arrays import Floats, check_turns, checked, refuse, whole
 from ...errors import InputError
 from ...formats.values import to_orientation
 
@@ -29,7 +29,7 @@ class Space:
     has_rotation: bool = False
 
     def __post_init__(self) -> None:
-        number("dimension", self.dimension, 2, 3, kind=int, allowed="2 or 3", hint="Roads are flat (2) or not (3).")
+        whole("dimension", self.dimension, 2, 3, "Roads are flat (2) or not (3).")
 
     @property
     def ambient(self) -> int:

@@ -4,7 +4,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ...arrays import Floats, Ints, number
+from ...arrays import Floats, Ints, whole
 from ...errors import InputError, shown
 from ...world.links import to_vector
 from ...world.recording import Recording, check_recording
@@ -106,10 +106,9 @@ def window(
     if noise is not None and not isinstance(noise, Noise):
         raise InputError("noise", shown(noise), "must be a noise model", "Give NoiseModel.nominal(sensors).")
     last, runs = len(recording.t) - 1, recording.runs
-    number("step", step, 0, last, kind=int, allowed=f"in 0..{last}", hint="The drive has no other steps.")
-    allowed = f"in 1..{step + 1} at step {step}"
-    number("length", length, 1, step + 1, kind=int, allowed=allowed, hint="Start later or shorten it.")
-    number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}", hint="A problem is one of the runs.")
+    whole("step", step, 0, last, "The drive has no other steps.")
+    whole("length", length, 1, step + 1, "Take a later step or shorten it.")
+    whole("run", run, 0, runs - 1, "A problem is one of the runs.")
     sensors: Sensors | None = recording.sensors
     if noise is None:
         fix_std = np.array(recording.sensors.gnss_std) * recording.fix_scale

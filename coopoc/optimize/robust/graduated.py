@@ -11,7 +11,7 @@ import numpy as np
 from numpy import inf
 from numpy.typing import ArrayLike
 
-from ...arrays import TINY, AnyArray, Floats, Ints, checked, frozen, number, plain
+from ...arrays import TINY, AnyArray, Floats, Ints, checked, frozen, number, plain, whole
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..assess.assess import squared
@@ -75,10 +75,9 @@ class Marked:
 def mark(problem: Problem, candidates: Candidates, groups: ArrayLike | None = None) -> Marked:
     """The problem with its candidates, checked; their bounds are yet to be given."""
     places, last = [], len(problem.factors) - 1
-    allowed = f"a factor in 0..{last} or (factor, rows)"
     for item in candidates if isinstance(candidates, Sequence) else [candidates]:
         k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
-        k = number("candidates", k, 0, last, kind=int, allowed=allowed, hint="See problem.factors.")
+        k = whole("candidates", k, 0, last, "Give factors of problem.factors, or (factor, rows).")
         factor = problem.factors[k]
         if factor.loss is not None:
             lacks = f"has a {factor.loss.name} loss already"
