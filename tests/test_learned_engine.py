@@ -43,11 +43,20 @@ def plain(nets, data, dt):
     return torch.stack([row.transpose(0, 1) for row in rows], 1)
 
 
+def loss_and_gradient(net, theta, data):
+    """Of an optimiser step from theta (S, P)."""
+    rows = np.arange(len(theta))
+    outcome = net.descend(
+        Moments(*(theta.numpy().copy() for _ in range(3))), data, Update(rows, 1, 0.1 * rows, 0.0, np.inf)
+    )
+    return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.gradient)
+
+
 def gradients(nets, data, dt):
     """Estimates and gradients of the squared error, of the engine and by torch's autograd through the reference."""
     theta = flatten(nets)
     found = nets[0].rollout(theta, data.gnss, data.velocity, data.x0, dt)
-    mine = nets[0].loss_and_gradient(theta, data._replace(dt=dt))[1]
+    mine = loss_and_gradient(nets[0], theta, data._replace(dt=dt))[1]
     expected = plain(nets, data, dt)
     (expected - data.truth).square().sum(-1).mean((0, 2)).sum().backward()
     by_torch = torch.stack([torch.cat([grad(p).flatten() for p in net.parameters()]) for net in nets])
@@ -107,7 +116,7 @@ def test_descent_is_that_of_torch(descend):
     """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the reference; other rows stay, and so does a
     row whose loss is not finite."""
     nets, data = [GainNet(2, 1, seed=s).double() for s in range(4)], batch(3, 3, 12, gaps=0.2)
-    data.truth[:, 1] = torch.inf
+    data.velocity[:, 1] = torch.inf
     theta, rates = flatten(nets), np.array([1e-2, 2e-2, 3e-2])
     started, state = theta.clone(), Moments(theta.numpy(), np.zeros(theta.shape), np.zeros(theta.shape))
     leaves = {0: nets[0], 2: nets[3]}
@@ -127,14 +136,11 @@ def test_descent_is_that_of_torch(descend):
     assert torch.equal(theta[1:3], started[1:3])
 
 
-def test_gradients_of_inputs_and_weights_go_through_the_reference():
+def test_gradients_of_inputs_go_through_the_reference():
     data, net = batch(1, 2, 5), GainNet(2, 1).double()
     gnss = data.gnss[:, 0].transpose(0, 1).clone().requires_grad_()
     net(gnss, data.velocity[:, 0].transpose(0, 1), data.x0[0], 0.1).sum().backward()
     assert float(grad(gnss).abs().sum()) > 0
-    theta = flatten([net])
-    (by_torch,) = torch.autograd.grad(net.losses(leaf := theta.clone().requires_grad_(), data).sum() / 2, leaf)
-    assert_close(by_torch, net.loss_and_gradient(theta, data)[1])
 
 
 def test_what_does_not_fit_is_named():
@@ -147,6 +153,6 @@ def test_what_does_not_fit_is_named():
     with refused("velocity"):
         net.rollout(theta, data.gnss, data.velocity[1:], data.x0, 0.1)
     with refused("truth"):
-        net.loss_and_gradient(theta, data._replace(truth=data.truth[1:]))
+        loss_and_gradient(net, theta, data._replace(truth=data.truth[1:]))
     with refused("dt"):
         net.rollout(theta, data.gnss, data.velocity, data.x0, torch.ones(4))

@@ -10,8 +10,7 @@ import pytest
 import torch
 from aggregation import Byzantine
 from conftest import refused, winding
-from numpy.testing import assert_allclose, assert_array_equal
-from scipy import stats
+from numpy.testing import assert_array_equal
 from torch import nn
 
 from coopoc import Sensors
@@ -299,14 +298,6 @@ def test_rules_are_those_of_flower(flower, ours, theirs, options):
         weights = answers(seed=seed)
         record, _ = getattr(flower, theirs)(**options).aggregate_train(1, replies(weights, sizes))
         torch.testing.assert_close(combined(ours, weights, sizes), flat(record), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 0.49])
-def test_trimmed_mean_is_that_of_scipy(share):
-    for count in (1, 4, 7):
-        weights = answers(count)
-        theirs = stats.trim_mean(weights.numpy(), share, axis=0)
-        assert_allclose(combined(TrimmedMean(share), weights, SIZES[:count]), theirs, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", [*RULES, Krum(2)])

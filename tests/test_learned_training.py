@@ -10,7 +10,7 @@ from conftest import refused, winding, without
 import coopoc.learned.training.fit as train
 from coopoc import Sensors
 from coopoc.learned import GainNet, Schedule, Segments, clients, federate, fit
-from coopoc.learned.nets.gain import Recurrent, flatten
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.training.clients import mirrored
 from coopoc.learned.training.schedule import cosine
 
@@ -54,24 +54,6 @@ def test_start_at_the_fix_or_the_truth():
     first = {start: clients(drives(), piece=10, start=start)[0].training for start in ("gnss", "true")}
     torch.testing.assert_close(first["gnss"].batch(index).x0[0], first["gnss"].gnss[:4, 0])
     assert float(first["true"].batch(index).x0.abs().max()) == 0.0
-
-
-def test_steps_are_those_of_torch():
-    """torch.optim.AdamW on autograd's gradient, a piece a step."""
-    net, pieces = GainNet(2, 1).double(), clients(drives(), piece=10)[0].training
-    double = {name: getattr(pieces, name).double() for name in ("gnss", "velocity", "truth")}
-    pool, theta = replace(pieces, **double), flatten([net])
-    optimiser, plan = torch.optim.AdamW(net.parameters(), 1e-2, weight_decay=0.3), np.array([[0], [2], [1]])
-    schedule = Schedule(weight_decay=0.3, clip=1e9, mirror=False)
-    for _ in train.descend(theta, net, pool, [plan], [np.full(3, 1e-2)], schedule, [torch.Generator()], {}):
-        pass
-    for index in plan:
-        optimiser.zero_grad()
-        batch = pool.batch(torch.from_numpy(index)[None])
-        gnss, velocity, truth = (part[:, 0].transpose(0, 1) for part in batch[:3])
-        (Recurrent.forward(net, gnss, velocity, batch.x0[0], batch.dt) - truth).square().sum(-1).mean().backward()
-        optimiser.step()
-    torch.testing.assert_close(theta, flatten([net]), rtol=1e-6, atol=1e-9)
 
 
 def test_mirroring_keeps_motion_and_noise():

@@ -6,7 +6,6 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from conftest import refused
-from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import star
 from scipy.optimize import least_squares
 from test_optimize_constraints import chain
@@ -69,15 +68,6 @@ def test_scipy_finds_the_same_minimum(dense, crossing_recording, case, backend):
         ours = solve(problem, backend)
         assert ours.cost == pytest.approx(cost, rel=1e-9)
         assert ours.x == pytest.approx(x, abs=2e-5)  # difference Jacobians stop there
-
-
-@pytest.mark.parametrize("backend", LOCAL)
-@pytest.mark.parametrize("length", [1, 5])
-def test_marginals_are_those_of_gtsams_bayes_tree(crossing_recording, length, backend):
-    problem = Problem.from_window(crossing_recording, 20, 0, length)
-    solution = solve(problem, backend)
-    theirs = bayes_tree_marginals(problem.whiten(solution.x)[1], None, len(problem.names), 3)
-    assert solution.covariance == pytest.approx(theirs, abs=1e-6)
 
 
 @pytest.mark.parametrize("backend", LOCAL)

@@ -56,18 +56,14 @@ class Gain(nn.Module, ABC):
         """The trained net, with what the loss cannot see set from the training segments of each client."""
         return self
 
-    def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
-        with torch.enable_grad():
-            leaf = theta.detach().requires_grad_()
-            means = self.losses(leaf, batch).mean(1)
-            (gradient,) = torch.autograd.grad(means.sum(), leaf)
-        return means.detach(), gradient
-
     def descend(self, moments: Moments, batch: Batch, update: Update) -> Outcome:
-        """One optimiser step in place of the rows (R,) of weights and moments, by their segments in a batch."""
-        losses, gradient = self.loss_and_gradient(torch.from_numpy(moments.theta[update.rows]), batch)
-        outcome = Outcome(gradient.numpy(), losses.numpy(), np.empty(len(losses), np.bool_))
+        """One optimiser step in place of the rows (R,) of weights and moments, by their segments in a batch: losses are
+        means over the batch."""
+        with torch.enable_grad():
+            leaf = torch.from_numpy(moments.theta[update.rows]).requires_grad_()
+            losses = self.losses(leaf, batch).mean(1)
+            (gradient,) = torch.autograd.grad(losses.sum(), leaf)
+        outcome = Outcome(gradient.numpy(), losses.detach().numpy(), np.empty(len(losses), np.bool_))
         advance(moments, outcome, update)
         return outcome
 

@@ -77,22 +77,12 @@ class GainNet(Recurrent):
             self.gain.weight.mul_(0.1)
             self.gain.bias.copy_(start_gain * torch.eye(STATE_SIZE).flatten())
 
-    def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Loss (S,) m^2, the mean over the batch, and its gradient (S, P) at theta (S, P); errors as `rollout`.
+    def descend(self, moments: Moments, batch: Batch, update: Update) -> Outcome:
+        """One optimiser step as in `Gain`; each model goes from rollout to new weights before the next one begins.
 
         References:
             Werbos, Proc. IEEE 1990 (backpropagation through time).
-
-        >>> still = torch.zeros(5, 1, 2, 3)
-        >>> GainNet().loss_and_gradient(torch.zeros(1, 19938), Batch(still, still, still, still[0], 0.1))[0]
-        tensor([0.])
         """
-        update = Update(np.arange(len(theta)), 0, np.empty(0), 0.0, 0.0)
-        outcome = self.descend(Moments(*[_array(theta, theta.dtype)] * 3), batch, update)
-        return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.gradient)
-
-    def descend(self, moments: Moments, batch: Batch, update: Update) -> Outcome:
-        """One optimiser step as in `Gain`; each model goes from rollout to new weights before the next one begins."""
         theta, plan, models = torch.from_numpy(moments.theta), plan_of(self.shapes), len(update.rows)
         drives = self._checked(theta, models, batch.gnss, batch.velocity, batch.x0, batch.dt)
         truth = _array(batch.truth, theta.dtype)
