@@ -30,7 +30,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from coopoc import Fleet, load_fleet
 from coopoc.data.fleet_files import write_table
-from coopoc.learned.checkpoint import read_card
+from coopoc.learned.checkpoint import read
 
 APP = Path(__file__).parent / "flower"
 HOST = "127.0.0.1"
@@ -225,7 +225,7 @@ def completed(site: Site) -> None:
 
 def show(out: Path) -> None:
     """Print the rounds of a checkpoint."""
-    card = read_card(out)
+    card = read(out)[1]
     print(f"{out}: {card['engine']}, clients {', '.join(card['clients'])}, best round {card['best']}")
     print(f"{'round':>5}{'validation, m^2':>25}{'sent, bytes':>13}{'received':>10}  rejected or absent")
     for row in card["history"]:

@@ -140,42 +140,27 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     return Checkpoint(model, card, history)
 
 
-def read_card(path: Path | str) -> Mapping[str, Any]:
-    """The card alone, without its weights."""
-    with _opened(given_path(path)) as file:
-        return _card(file, path)
-
-
-def _opened(path: Path) -> Any:
-    if not path.is_file():
-        raise InputError("checkpoint", path, "must be an existing file", "Train it with train_all or coopoc train.")
-    try:
-        return safetensors.safe_open(path, framework="pt")
-    except safetensors.SafetensorError as error:
-        raise InputError("checkpoint", path, f"is no safetensors file ({error})", "Train it again.") from error
-
-
-def _card(file: Any, path: Path | str) -> dict[str, Any]:
-    try:
-        card = json.loads((file.metadata() or {}).get("card", "null"))
-    except (ValueError, RecursionError) as error:
-        raise InputError("checkpoint", path, f"has a damaged card ({error})", "Train it again.") from None
-    if not isinstance(card, dict):
-        raise InputError(
-            "checkpoint", path, "must carry a card of named fields in its metadata", "Write it with checkpoint.save."
-        )
-    return card
-
-
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and card of a file, its checksum checked.
 
     Raises:
         InputError: no such file, another format, a wrong checksum or none.
     """
-    with _opened(path) as file:
-        content = {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
+    if not path.is_file():
+        raise InputError("checkpoint", path, "must be an existing file", "Train it with train_all or coopoc train.")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            card = json.loads((file.metadata() or {}).get("card", "null"))
+    except safetensors.SafetensorError as error:
+        raise InputError("checkpoint", path, f"is no safetensors file ({error})", "Train it again.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError("checkpoint", path, f"has a damaged card ({error})", "Train it again.") from None
+    if not isinstance(card, dict):
+        raise InputError(
+            "checkpoint", path, "must carry a card of named fields in its metadata", "Write it with checkpoint.save."
+        )
     if not holds(path.read_bytes()):
         hint = "Copy it again from where it came from, or write it with coopoc.learned.save."
         raise InputError("checkpoint", path, "has no checksum, or another content than it says: it is damaged", hint)
-    return content
+    return tensors, card

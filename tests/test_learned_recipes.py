@@ -24,7 +24,7 @@ from coopoc.learned import (
     save,
     train_all,
 )
-from coopoc.learned.checkpoint import read_card, write
+from coopoc.learned.checkpoint import read, write
 from coopoc.learned.nets.gain import flatten
 
 
@@ -62,7 +62,7 @@ def test_every_kind_of_net_round_trips(net, tmp_path):
 
 def test_another_shape_history_and_kind_are_refused_naming_both(tmp_path):
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(5, 40), {}))
-    tensors, card = load_file(path), read_card(path)
+    tensors, card = load_file(path), read(path)[1]
     tensors["gain.weight"] = torch.zeros(9, 90)
     write(path, tensors, {"kind": "gain_net", "net": {"in_mult": 5, "out_mult": 40}})
     assert card["parameters"] == 23_928
@@ -111,11 +111,11 @@ def test_what_changes_the_weights_changes_the_key(tmp_path, monkeypatch):
     fleet = drives()
     train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
     (path,) = tmp_path.iterdir()
-    before = read_card(path)["key"]
+    before = read(path)[1]["key"]
     faster = replace(recipes.RECIPES["centralised"], schedule=Schedule(epochs=3, batch=2, checks=2, learning_rate=50.0))
     monkeypatch.setitem(recipes.RECIPES, "centralised", faster)
     train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"])
-    card = read_card(path)
+    card = read(path)[1]
     assert card["key"] != before
     assert "learning_rate=50" in card["warning"]
     path.write_bytes(path.read_bytes()[:-1])
@@ -166,7 +166,7 @@ EACH = pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIG
 def test_shipped_weights_hold_over_unseen_drives(name):
     """They trained on pieces of 100 steps and other vehicles; here are 900 steps, and no run may drift away."""
     fleet, method = load_fleet("town10"), load_method(name)
-    assert read_card(recipes.WEIGHTS / f"{name}.safetensors")["digest"] == load_fleet("town10-clients").digest
+    assert read(recipes.WEIGHTS / f"{name}.safetensors")[1]["digest"] == load_fleet("town10-clients").digest
     some = fleet.select(fleet.ids[::10])
     recording = observe(some, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=3)
     found, egos = method(recording, range(6)), range(6)
@@ -198,7 +198,7 @@ def test_cards_say_what_was_trained_and_how_well(name):
 def test_shipped_weights_are_made_again_from_their_recipe(name):
     """To 1e-5 with the versions and the kind of machine that the card names, a few last bits of float32 after thousands
     of steps on another processor of that kind; elsewhere training ends within a few percent."""
-    card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
+    card = read(recipes.WEIGHTS / f"{name}.safetensors")[1]
     same = card["environment"]["torch"] == torch.__version__ and card["machine"] == shipped.machine()
     assert shipped.differences(name, progress=False)[name] < (1e-5 if same else 0.3)
 

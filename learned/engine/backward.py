@@ -6,8 +6,9 @@ import numpy as np
 
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.kernels.compiling.compile import compiled, part, summing
-from coopoc.learned.engine.forward import Drives, State, follow, missing, new_state
-from coopoc.learned.engine.layers import (
+
+from .forward import Drives, State, follow, missing, new_state
+from .layers import (
     CELLS,
     FROM_H,
     FROM_X,
@@ -23,7 +24,7 @@ from coopoc.learned.engine.layers import (
     pack,
     unpack,
 )
-from coopoc.learned.engine.tile import Index, apart
+from .tile import Index, apart
 
 
 class Moments(NamedTuple):

@@ -6,7 +6,8 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import compiled, part, storage
-from coopoc.learned.engine.layers import (
+
+from .layers import (
     CELLS,
     FROM_H,
     FROM_X,
@@ -22,7 +23,7 @@ from coopoc.learned.engine.layers import (
     tanh,
     unpack,
 )
-from coopoc.learned.engine.tile import Index, apart
+from .tile import Index, apart
 
 FOLLOWED = 16
 """Drives that are followed together, so that weights are fetched once for them."""

@@ -13,7 +13,8 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints
 from coopoc.kernels.compiling.compile import inside, part, storage
-from coopoc.learned.engine.tile import Index, apart, product
+
+from .tile import Index, apart, product
 
 STATE_SIZE = 3
 """Components of state and measurement, m = n = 3."""

@@ -16,7 +16,8 @@ from coopoc.arrays import one_of, whole
 from coopoc.paths import given_path
 from coopoc.text import visible
 
-from ..checkpoint import Checkpoint, read_card, save
+from ..checkpoint import Checkpoint, save
+from ..checkpoint import read as read_checkpoint
 from ..federation.history import Federation, Round
 from ..federation.rules import SERVER, implausible, rule, screen, too_few
 from ..nets.gain import Gain, flatten
@@ -93,7 +94,7 @@ def configured(grid: "Grid", context: "Context") -> None:
         raise InputError("recipe", job.name, allowed, "Train it in one process: coopoc train.")
 
     if out.is_file():
-        names |= {int(node): str(name) for node, name in read_card(out).get("nodes", {}).items()}
+        names |= {int(node): str(name) for node, name in read_checkpoint(out)[1].get("nodes", {}).items()}
 
     def keep(row: Row) -> None:
         rows.append(row)
