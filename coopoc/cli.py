@@ -51,7 +51,7 @@ def run(
     /,
     data: Annotated[str | None, arg(metavar="NAME_OR_PATH")] = None,
     out: Folder = Path("runs"),
-    jobs: Annotated[int, arg(metavar="N")] = 1,
+    jobs: int = 1,
     set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEY=VALUE ...")] = (),
     retry_failed: bool = False,
     dry_run: bool = False,

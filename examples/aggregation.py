@@ -27,8 +27,9 @@ from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.studies import lineup, scene
 from coopoc.studies.views import TableView, of, selections
+from coopoc.study.cell import Params, Row
 from coopoc.study.numbers import Where, across, by_seed, interval, listed, mean, paired, seed_means
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Study
 from coopoc.study.style import look
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording

@@ -21,8 +21,8 @@ from coopoc.evaluate.scores import causal, scored
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.paths import write
 from coopoc.plugins import find, in_file
+from coopoc.study.cell import Params, Row
 from coopoc.study.numbers import three
-from coopoc.study.study import Params, Row
 from coopoc.study.style import NOT_CAUSAL_SUFFIX
 from coopoc.workers import progress_bar
 

@@ -10,8 +10,8 @@ from coopoc import rt_le
 from coopoc.arrays import Floats
 from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval
+from coopoc.study.cell import Params, Row
 from coopoc.study.numbers import Results, Where, mean, ran, seed_means
-from coopoc.study.study import Params, Row
 from coopoc.study.style import CLIENTS, Panel, look
 
 from . import lineup, scene, weights

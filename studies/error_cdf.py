@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from coopoc.study.cell import Params
 from coopoc.study.numbers import Number, Results, Where, interval, listed, mean, present, seed_std, verdict
-from coopoc.study.study import Params
 from coopoc.study.style import Panel, look
 
 from . import lineup, scene, weights

@@ -10,11 +10,10 @@ import numpy as np
 
 from coopoc import InputError, Study
 from coopoc.arrays import Floats, one_of, refuse
-from coopoc.errors import unknown
 from coopoc.paths import given_path
 from coopoc.plugins import called, find, holders, in_file, names
+from coopoc.study.cell import Params, Row
 from coopoc.study.provenance import code_of
-from coopoc.study.study import Params, Row
 from coopoc.study.style import NOT_CAUSAL_SUFFIX
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -155,8 +154,8 @@ def named_method(name: str) -> "Method":
     from coopoc.learned import load_method
     from coopoc.learned.recipes import shipped_weights
 
-    if name not in shipped_weights() and not given_path(name).is_file():
-        raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
+    if not given_path(name).is_file():
+        one_of("method", name, (*names("coopoc.methods"), *shipped_weights()))
     return load_method(name)
 
 

@@ -1,7 +1,7 @@
 """Collaborative training against collaborative decision: RT-LE against neighbours (paper, Fig. 5)."""
 
+from coopoc.study.cell import Params
 from coopoc.study.numbers import Results, interval, listed, mean, present, rms
-from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
 from . import lineup, scene, weights

@@ -14,7 +14,7 @@ LEAD = "After “Federated Data-Driven Kalman Filtering for State Estimation” 
 
 def paper(
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper"),
-    jobs: Annotated[int, arg(metavar="N")] = 2,
+    jobs: int = 2,
     data: Annotated[str, arg(metavar="NAME_OR_PATH")] = "town10",
 ) -> int:
     """Reproduce the paper's comparison: train, run its three studies, write one report. Repeat to resume.

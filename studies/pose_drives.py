@@ -18,7 +18,7 @@ from coopoc.data.log.residuals import GATE_STDS, begin_of, together
 from coopoc.data.mrclam import calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, read_log
 from coopoc.data.source import split, while_unchanged
-from coopoc.study.study import Params
+from coopoc.study.cell import Params
 from coopoc.world.storage import digest
 
 LONGEST_CALIBRATION, CALIBRATION_SHARE = 300.0, 0.4

@@ -13,9 +13,9 @@ from coopoc.data.log.residuals import GATE_STDS
 from coopoc.data.source import split, while_unchanged
 from coopoc.evaluate.metrics import errors, fix_innovations
 from coopoc.evaluate.scores import online_columns
+from coopoc.study.cell import Params, Row
 from coopoc.study.numbers import Results, Where, across, difference, interval, mean, present, ran
 from coopoc.study.provenance import revision
-from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel, look, words
 from coopoc.study.tables import Table, crossed, unused
 

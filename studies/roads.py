@@ -15,7 +15,7 @@ from coopoc.data.log.links import under
 from coopoc.data.log.read import is_log
 from coopoc.data.log.residuals import in_space, plane
 from coopoc.data.source import split
-from coopoc.study.study import Row
+from coopoc.study.cell import Row
 from coopoc.world.recording import NOTHING_SIMULATED
 
 from .pose_drives import BLOCK_SECONDS, CALIBRATION_SHARE, MIN_BLOCKS, hashed

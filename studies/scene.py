@@ -10,8 +10,8 @@ import numpy as np
 from coopoc import V2X, Fleet, InputError, Outliers, Recording, Sensors, observe
 from coopoc.arrays import Bools, one_of, runs_in_memory, seed_of
 from coopoc.data.source import split, there, while_unchanged
+from coopoc.study.cell import Params
 from coopoc.study.provenance import revision
-from coopoc.study.study import Params
 from coopoc.world.channels import channel as channel_of
 from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest

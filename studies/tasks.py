@@ -34,7 +34,7 @@ from coopoc.data.log.residuals import GATE_STDS
 from coopoc.evaluate.metrics import errors
 from coopoc.evaluate.scores import online_columns
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.study.study import Row
+from coopoc.study.cell import Row
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives

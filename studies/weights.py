@@ -14,7 +14,7 @@ from coopoc.arrays import whole
 from coopoc.data.source import while_unchanged
 from coopoc.errors import unknown
 from coopoc.plugins import find, from_file, in_file
-from coopoc.study.study import Params
+from coopoc.study.cell import Params
 from coopoc.world.sensors import VelocityReading
 
 from .scene import fleet, is_real, start
@@ -163,7 +163,7 @@ def train(
     /,
     data: Annotated[str, arg(metavar="NAME_OR_PATH")] = "town10-clients",
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/weights"),
-    seed: Annotated[int, arg(metavar="N")] = 0,
+    seed: int = 0,
     aggregate: Annotated[str | None, arg(metavar="RULE")] = None,
     worse: bool = False,
 ) -> None:

@@ -18,11 +18,10 @@ from coopoc.evaluate.statistics import WORSE_RATIO, mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.paths import made_folder, write
 from coopoc.plugins import file_digest, in_file
-from coopoc.study.cell import Cell
+from coopoc.study.cell import Cell, Params, Row
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 from coopoc.study.run import compute
-from coopoc.study.study import Params, Row
 from coopoc.workers import progress_bar
 
 from .lineup import named_method

@@ -16,8 +16,6 @@ from .results import NO_VALUES
 from .style import Panel, label, look, words
 from .tables import failed
 
-__all__ = ["Plot", "curves", "pareto", "sweep"]
-
 
 def sweep(results: Results, x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
     """Plot RT-LE against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.

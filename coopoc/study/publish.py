@@ -6,7 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError, unknown
+from ..arrays import one_of
+from ..errors import InputError
 from ..paths import file_name, given_path, write
 from ..workers import progress_bar
 from . import store
@@ -116,8 +117,8 @@ def tables(folder: str | Path, form: str = "markdown", name: str | None = None) 
         InputError: as `views`, or an unknown name or format.
     """
     shown = {view["name"]: view for view in views(folder)["tables"]}
-    if name is not None and name not in shown:
-        raise unknown("table", name, shown)
+    if name is not None:
+        one_of("table", name, shown)
     return [Table.from_data(shown[n].get("table")).render(form) for n in (shown if name is None else [name])]
 
 

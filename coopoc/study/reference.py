@@ -17,8 +17,9 @@ from ..evaluate.statistics import Interval
 from ..paths import given_path, write
 from ..plugins import names
 from . import store
+from .cell import Params
 from .results import SEED, Results, ego_by_run, whole
-from .study import Params, find_study
+from .study import find_study
 from .style import label, words
 from .tables import Entry, Table
 

@@ -10,8 +10,8 @@ import pandas as pd
 import pyarrow as pa
 from pandas import DataFrame
 
-from ..arrays import Floats, listed
-from ..errors import InputError, unknown
+from ..arrays import Floats, listed, one_of
+from ..errors import InputError
 from ..evaluate.statistics import Interval, mean_interval
 from ..paths import given_path
 from ..text import short_repr
@@ -99,8 +99,7 @@ class Results:
         if frame.empty and self.failed:
             raise InputError("results", "no row", f"{self.failed} cells failed", f"{self.failures['reason'][0]}.")
         for name, wanted in {**(where or {}), **also}.items():
-            if name not in frame:
-                raise unknown("column", name, frame.columns)
+            one_of("column", name, frame.columns)
             values = list(wanted) if pd.api.types.is_list_like(wanted) else [wanted]
             for value in values:
                 if not _is(self.frame[name], value).any():
@@ -133,8 +132,7 @@ class Results:
             raise InputError("where", dict(where), "must have a row with all of these values", "Name fewer of them.")
         by = listed("by", by, 'Give ["method"].')
         for name in by:
-            if name not in frame:
-                raise unknown("column", name, frame.columns)
+            one_of("column", name, frame.columns)
         yield from frame.groupby(by, sort=False, dropna=False)
 
     def summary(self, by: Sequence[str], value: str, where: Params | None = None) -> DataFrame:
@@ -156,8 +154,7 @@ class Results:
         return DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
     def _one_cell(self, frame: DataFrame, by: Sequence[str], value: str) -> None:
-        if value not in frame:
-            raise unknown("metric", value, frame.columns)
+        one_of("metric", value, frame.columns)
         if len(scores := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(scores):
             raise InputError("metric", repr(value), "must be a column of numbers", "It holds text or lists.")
         for axis in self.axes:

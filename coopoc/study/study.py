@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import instance, listed, named
-from ..errors import InputError, unknown
+from ..arrays import instance, listed, named, one_of
+from ..errors import InputError
 from ..paths import file_name
 from ..plugins import file_digest, find, from_file, in_file
 from .cell import Cell, Params, Row, Scalar, digest, entries, parse
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from .results import Results
     from .tables import Table
 
-
-__all__ = ["Cell", "Params", "Row", "Scalar", "Study", "find_study"]
 Tracks: TypeAlias = Callable[[Params], Iterable[tuple[Any, ...]]]
 
 
@@ -155,8 +153,7 @@ class Study:
             if name in settings:
                 settings[name] = parse(name, value, settings[name])
                 continue
-            if name not in axes:
-                raise unknown("setting", name, [*settings, *axes])
+            one_of("setting", name, (*settings, *axes))
             usual = axes[name]
             wanted = [parse(name, v, None if None in usual else next(iter(usual), None)) for v in entries(value)]
             if isinstance(grid, Mapping):

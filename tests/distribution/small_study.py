@@ -12,8 +12,9 @@ import numpy as np
 from coopoc.evaluate.metrics import max_error, rt_le
 from coopoc.methods.kalman import GNSS, Kalman
 from coopoc.methods.star_filters import JointFilter
+from coopoc.study.cell import Params, Row
 from coopoc.study.results import Results
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Study
 from coopoc.study.tables import Table, pivot
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
