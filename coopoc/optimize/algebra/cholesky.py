@@ -180,5 +180,4 @@ def _parents(lower: Any) -> Ints:
 
 def _runs(first: Ints, length: Ints) -> Ints:
     """first[k], first[k] + 1, ... of each length[k]."""
-    total = np.cumsum(length)
-    return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(first - (total - length), length))
+    return np.asarray(np.arange(length.sum()) + np.repeat(first + length - np.cumsum(length), length))

@@ -246,8 +246,8 @@ def sparse(problem: Problem) -> Sparse:
     Raises:
         InputError: a formula that CasADi cannot run.
     """
-    kept = problem.__dict__.get("sparse")
+    kept: Sparse | None = problem.__dict__.get("sparse")
     if kept is None:
-        kept = Sparse(problem.space, layout_of(structure_of(problem)), tuple(map(numbers_of, problem.factors)))
-        problem.__dict__["sparse"] = kept
+        numbers = tuple(map(numbers_of, problem.factors))
+        kept = problem.__dict__["sparse"] = Sparse(problem.space, layout_of(structure_of(problem)), numbers)
     return kept

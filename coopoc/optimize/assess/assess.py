@@ -326,7 +326,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
     directions that remain, eased by SLACK. The far side of a range that must be met is a stationary point too, and a
     maximum. Source: Nocedal and Wright, Numerical Optimization, 2nd ed., theorem 12.6.
     """
-    if problem.linear and all(c.measurement.linear for c in problem.constraints):
+    if problem.linear:
         return True
     if active.along.shape[0] == active.along.shape[1]:  # no direction is taken away
         return newton_decrease(problem.replace_unchecked(constraints=()), x) is not None
@@ -376,9 +376,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
     most, spread = expected(problem, out, truth.leverage) if pushing else (mean, variance)
     if implausible(truth.cost - spent, most, spread):
-        convex = not problem.movable.any() or (
-            problem.linear and all(c.measurement.linear for c in problem.constraints)
-        )
+        convex = problem.linear or not problem.movable.any()
         whys = [] if convex else ["a local minimum (try other x0, or certify it)"]
         if pushing:
             whys += [f"{pushing} bounds that push contradict the measurements"]

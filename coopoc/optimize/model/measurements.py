@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ...arrays import Bools, Floats, instance, one_of, whole
-from ...errors import InputError, unknown
+from ...errors import InputError
 from ...plugins import find, in_file, names
 from ...world.links import spherical as to_spherical
 from .space import Space
@@ -161,8 +161,8 @@ def lookup(kind: str) -> Measurement:
     if isinstance(kind, str) and kind in MEASUREMENTS:
         return MEASUREMENTS[kind]
     plugins = names("coopoc.measurements")
-    if not isinstance(kind, str) or not (in_file(kind) or kind in plugins):
-        raise unknown("kind", kind, sorted({*MEASUREMENTS, *plugins}))
+    if not (isinstance(kind, str) and in_file(kind)):
+        one_of("kind", kind, sorted({*MEASUREMENTS, *plugins}))
     formula = find("coopoc.measurements", kind)
     for registered in MEASUREMENTS.values():
         if registered.formula is formula:
@@ -181,14 +181,14 @@ PLANE = (0, 1)
 SEEN: tuple[Component, ...] = ("distance", "angle", "angle")
 
 
-def vector(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
+def vector(x: Any, y: Any, z: Any, m: Any) -> Sequence[Any]:
     """The vector of the frame itself: m."""
     return x, y, z
 
 
 def spherical_part(first: int, end: int) -> Formula:
     """Of range, azimuth and inclination of the frame's vector those from `first` to before `end`: m, rad."""
-    return lambda x, y, z, m=np: to_spherical(x, y, z, m)[first:end]
+    return lambda x, y, z, m: to_spherical(x, y, z, m)[first:end]
 
 
 for _name, _arity, _frame in (
@@ -210,20 +210,20 @@ for _name, _frame, _first, _end in (
 
 
 @measurement("speed", arity=2, components=("distance",), plane=(0,), constants=1)
-def speed(dx: Any, dy: Any, dz: Any, dt: Any, m: Any = np) -> Sequence[Any]:
+def speed(dx: Any, dy: Any, dz: Any, dt: Any, m: Any) -> Sequence[Any]:
     """Mean speed between two positions of a vehicle that are dt apart (the constant, s): m/s."""
     return (to_spherical(dx, dy, dz, m)[0] / dt,)
 
 
 @measurement("range_offset", arity=3, components=("coordinate",), frame="nodes", plane=(0,))
-def range_offset(a: Any, b: Any, offset: Any, m: Any = np) -> Sequence[Any]:
+def range_offset(a: Any, b: Any, offset: Any, m: Any) -> Sequence[Any]:
     """Distance between two nodes and the first coordinate of a third, an offset that ranges share: m."""
     x, y, z = (q - p for p, q in zip(a[:3], b[:3], strict=True))
     return (to_spherical(x, y, z, m)[0] + offset[0],)
 
 
 @measurement("antenna", arity=2, components=VECTOR, frame="nodes", plane=PLANE)
-def antenna(node: Any, arm: Any, m: Any = np) -> Sequence[Any]:
+def antenna(node: Any, arm: Any, m: Any) -> Sequence[Any]:
     """Where the antenna of a node is, p + R l, the arm l (forward, left, up; of a point east, north, up) a node: m."""
     at, turned = node[:3], node[3]
     return [at[i] + sum(turned[i][j] * arm[j] for j in range(3)) for i in range(3)]
@@ -238,7 +238,7 @@ PLANES = ((1, 2), (2, 0), (0, 1))
 """Axes about which x, y and z turn."""
 
 
-def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
+def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any) -> Sequence[Any]:
     """Rz^T (t - tz) and Log(Rz^T R), the error of a relative pose (t, R) against a measured (tz, Rz): m, rad."""
     *at, turned = measured
     gap = [x - at[0], y - at[1], z - at[2]]
@@ -255,7 +255,7 @@ def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequ
     return *moved, *(ratio * h for h in half)
 
 
-def logarithm(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
+def logarithm(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any) -> Sequence[Any]:
     """Log(Tz^-1 T), the twist that takes a measured pose Tz to the relative pose T: GTSAM's BetweenFactor, m and rad.
 
     Its rotation vector w is that of `geodesic`, its translation u - w x u / 2 + c w x (w x u) with
@@ -285,7 +285,7 @@ def _half_cotangent(square: Any, m: Any) -> Any:
     return m.where(large, exact, series)
 
 
-def chordal(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
+def chordal(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any) -> Sequence[Any]:
     """t - tz and the nine entries of R - Rz: PyFG's objective, quadratic in positions and rotation matrices: m, 1."""
     *at, turned = measured
     return x - at[0], y - at[1], z - at[2], *(R[i][j] - turned[i][j] for i in range(3) for j in range(3))

@@ -144,8 +144,9 @@ class Problem:
 
     @cached_property
     def linear(self) -> bool:
-        """True if the residuals are linear in x and the cost is quadratic."""
-        return all(f.measurement.linear and f.loss is None for f in self.factors)
+        """True if residuals and constraints are linear in x and the cost is quadratic."""
+        quadratic = all(f.measurement.linear and f.loss is None for f in self.factors)
+        return quadratic and all(c.measurement.linear for c in self.constraints)
 
     def index(self, node: str | int) -> int:
         """Index of a node given by name or index; InputError if there is none."""
@@ -174,14 +175,14 @@ class Problem:
             kind,
             index,
             rows(kind, z, len(index)),
-            std=std,  # type: ignore[arg-type]
-            sqrt_information=sqrt_information,  # type: ignore[arg-type]
-            constants=constants,  # type: ignore[arg-type]
-            loss=loss,
+            std,  # type: ignore[arg-type]
+            sqrt_information,  # type: ignore[arg-type]
+            constants,  # type: ignore[arg-type]
+            loss,
             cov=cov,
         )
         if cov is not None:
-            check_std(factor.measurement, np.sqrt(np.diagonal(np.asarray(cov), 0, -2, -1)), (len(index), factor.size))
+            check_std(factor.measurement, np.sqrt(np.diagonal(cov, 0, -2, -1)), (len(index), factor.size))
         # it alone is checked: what was checked and found before is kept
         self._check(factor)
         return self.replace_unchecked(factors=(*self.factors, factor))
