@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import sys
-import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import EntryPoint, version
@@ -19,6 +18,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from . import plugins
 from .errors import InputError, MissingLibraryError, missing, unknown
+from .workers import say
 
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 Folder: TypeAlias = Annotated[Path, arg(metavar="FOLDER")]
@@ -93,12 +93,12 @@ def run(
         print(text, end="\n\n")
     for _, row in results.failures.head(5).iterrows():
         params = (f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
-        print(f"coopoc: failed: {row['reason']} ({', '.join(params)})", file=sys.stderr)
-        print(textwrap.indent("\n".join(row["traceback"].splitlines()[-5:]), "  "), file=sys.stderr)
+        lines = [f"failed: {row['reason']} ({', '.join(params)})", *row["traceback"].splitlines()[-5:]]
+        say("\n  ".join(lines))
     if tracks == "tum":
-        print(f"coopoc: estimates are in {write_tracks(name, out, changes)}", file=sys.stderr)
+        say(f"estimates are in {write_tracks(name, out, changes)}")
     failed = f"; cells failed: {results.failed}, try them again with --retry-failed" if results.failed else ""
-    print(f"coopoc: results are in {folder}{failed}. Report: coopoc report {shlex.quote(str(folder))}", file=sys.stderr)
+    say(f"results are in {folder}{failed}. Report: coopoc report {shlex.quote(str(folder))}")
     return int(results.failed > 0)
 
 
@@ -164,19 +164,19 @@ def _status(argv: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (problem := missing(error, " ".join(["coopoc", *argv[:1]]))) is error:
             raise
-        print(f"coopoc: {problem}", file=sys.stderr)
+        say(problem)
         return 2
     except (InputError, MissingLibraryError) as error:
-        print(f"coopoc: {error}", file=sys.stderr)
+        say(error)
         return 2
     except KeyboardInterrupt:
-        print("coopoc: interrupted. A study keeps its finished cells: repeat its command to resume.", file=sys.stderr)
+        say("interrupted. A study keeps its finished cells: repeat its command to resume.")
         return 130
     except BrokenPipeError:  # the reader of stdout has ended, as in: coopoc table FOLDER | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (OSError, MemoryError) as error:
-        print(f"coopoc: {error}", file=sys.stderr)
+        say(error)
         return 1
 
 

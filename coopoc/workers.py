@@ -64,6 +64,11 @@ def one_thread() -> Iterator[None]:
                 first.restore_original_limits()
 
 
+def say(message: object) -> None:
+    """Print a message to stderr, beside the result on stdout."""
+    print(f"coopoc: {message}", file=sys.stderr)
+
+
 LINE_SECONDS = 60.0
 """s between two lines of a bar where stderr is no terminal."""
 

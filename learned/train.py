@@ -1,7 +1,6 @@
 """Training of recipes: `train_all` makes every checkpoint that a study needs, or finds it."""
 
 import os
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -16,7 +15,7 @@ from coopoc import InputError
 from coopoc.arrays import listed, whole
 from coopoc.paths import given_path, made_folder
 from coopoc.plugins import in_file
-from coopoc.workers import leave_with
+from coopoc.workers import leave_with, say
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read, save
@@ -114,9 +113,9 @@ def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> 
     path = out / f"{job.label}.safetensors"
     if path.is_file() and _key(path) != checkpoint.card["key"]:
         kept = path.rename(path.with_suffix(f".{_key(path)[:8]}{path.suffix}"))
-        print(f"coopoc: what was trained otherwise, or is damaged, is kept as {kept}", file=sys.stderr)
+        say(f"what was trained otherwise, or is damaged, is kept as {kept}")
     if untrained_note := checkpoint.card.get("warning"):
-        print(f"coopoc: {job.label}: {untrained_note}", file=sys.stderr)
+        say(f"{job.label}: {untrained_note}")
     save(path, checkpoint)
 
 

@@ -1,7 +1,6 @@
 """coopoc benchmark: a score card of any method on CL-Bench's tasks, and the table of all cards."""
 
 import json
-import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,7 @@ from coopoc.plugins import find, in_file
 from coopoc.study.cell import Params, Row
 from coopoc.study.numbers import three
 from coopoc.study.style import NOT_CAUSAL_SUFFIX
-from coopoc.workers import progress_bar
+from coopoc.workers import progress_bar, say
 
 from .lineup import named_method, own
 from .pose_drives import POSES
@@ -103,7 +102,7 @@ def benchmark(
         made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
         write(file, json.dumps(made, indent=1) + "\n")
-        print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
+        say(f"{file}, {time.perf_counter() - began:.1f} s")
         print(page([made]))
     if table:
         drawn_worlds, cards = (
@@ -164,7 +163,7 @@ def _row(task: str, made: Callable[[], Row]) -> Row:
     try:
         return made()
     except (Exception, SystemExit) as error:  # a failure is a row
-        print(f"coopoc: failed: {task}", *traceback.format_exc().splitlines()[-5:], sep="\n  ", file=sys.stderr)
+        say("\n  ".join([f"failed: {task}", *traceback.format_exc().splitlines()[-5:]]))
         return {"task": task, "failed": f"{type(error).__name__}: {said(error)}"}
 
 
@@ -189,7 +188,7 @@ def card(name: str, drawn: Mapping[str, Task], data: Path | None = None, tasks: 
     chosen = {}
     for task, run in runnable(name, drawn, data).items():
         if data and not tasks and task in PUBLISHED and not holds(data, task):
-            print(f"coopoc: {task} is left out: no {PUBLISHED[task][0]} below {data}", file=sys.stderr)
+            say(f"{task} is left out: no {PUBLISHED[task][0]} below {data}")
         elif task in tasks or (not tasks and (data or task in drawn)):
             chosen[task] = run
     bar = progress_bar(chosen.items(), name, unit="task", delay=2.0)

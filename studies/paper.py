@@ -1,6 +1,5 @@
 """coopoc paper: its studies with shared weights, and one report that answers their questions."""
 
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -29,12 +28,13 @@ def paper(
     from coopoc import run_study
     from coopoc.data.registry import DATASETS, card, in_words
     from coopoc.study.report import report
+    from coopoc.workers import say
 
     began, failed, inputs = time.perf_counter(), 0, {"weights": str(out / "weights"), "data": data}
     for number, name in enumerate(PAPER_STUDIES, start=1):
-        print(f"coopoc: stage {number} of {len(PAPER_STUDIES) + 1}: {name}", file=sys.stderr)
+        say(f"stage {number} of {len(PAPER_STUDIES) + 1}: {name}")
         failed += run_study(name, out=out, jobs=jobs, settings=inputs, retry_failed=True).failed
-    print(f"coopoc: stage {len(PAPER_STUDIES) + 1} of {len(PAPER_STUDIES) + 1}: report", file=sys.stderr)
+    say(f"stage {len(PAPER_STUDIES) + 1} of {len(PAPER_STUDIES) + 1}: report")
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
     chosen = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
     page = report(
@@ -45,5 +45,5 @@ def paper(
         cards={name: in_words(card(name)) for name in bundled},
     )
     took = f"{(time.perf_counter() - began) / 60:.1f} min"
-    print(f"coopoc: done in {took}, {failed} failed cells. The report is {page}", file=sys.stderr)
+    say(f"done in {took}, {failed} failed cells. The report is {page}")
     return int(failed > 0)

@@ -1,7 +1,6 @@
 """Score card of a method on worlds: how often and by how much it is worse than being alone or a textbook filter."""
 
 import json
-import sys
 import time
 from collections.abc import Sequence
 from functools import lru_cache, partial
@@ -22,7 +21,7 @@ from coopoc.study.cell import Cell, Params, Row
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 from coopoc.study.run import compute
-from coopoc.workers import progress_bar
+from coopoc.workers import progress_bar, say
 
 from .lineup import named_method
 from .tasks import VERSION
@@ -105,7 +104,7 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
         lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in cards[-1].items())
         write(file, "{\n" + ",\n".join(lines) + "\n}\n")  # a card is read by people and kept in a repository
         print(details(cards[-1]), end="\n\n")
-        print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
+        say(f"{file}, {time.perf_counter() - began:.1f} s")
     print(overview(cards))
     return int(any(card["failed"] for card in cards))
 
@@ -153,7 +152,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
             rows += [{"seed": at, **row} for row in outcome.rows.to_pylist()]
             continue
         failed[at] = outcome.reason.partition("\n")[0][:200]
-        print(f"coopoc: failed: world {at}: {failed[at]}", file=sys.stderr)
+        say(f"failed: world {at}: {failed[at]}")
         rows.append({"seed": at, "kinds": "; ".join(world(at, split).kinds), "noted": 1.0})
     frame = _frame(rows)
     each_kind = frame.assign(kind=frame["kinds"].replace("", NONE).str.split("; ")).explode("kind")

@@ -1,7 +1,6 @@
 """coopoc solve and coopoc check: the solvers from the command line."""
 
 import json
-import sys
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -15,6 +14,7 @@ from ..arrays import one_of
 from ..errors import InputError, dependencies
 from ..formats import load_graph
 from ..paths import replaceable, write
+from ..workers import say
 from .backend import backends
 from .graph_problems import Objective, Start, from_graph, loop_closures
 from .model.problem import Problem
@@ -58,7 +58,7 @@ def solve_file(
     if output is not None:
         one_of("ending of --output", replaceable(output).suffix, (".json",))
     problem = from_graph(load_graph(file, repair), objective, "odometry" if outliers else start)
-    say(str(problem))
+    say(problem)
     solve_one = partial(solve, throw=False, covariance=covariance or None)
     solution = (without_outliers if outliers else solve_one)(problem, backend)
     summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
@@ -74,11 +74,6 @@ def solve_file(
     if size is not None and not 1 / UNLIKELY_FACTOR < size < UNLIKELY_FACTOR:
         say(f"residuals are {size:.2g} times what the file states. {COVARIANCE_HINT}")
     return int(solution.status is not Status.SOLVED)
-
-
-def say(message: str) -> None:
-    """Print a message to stderr, beside the result on stdout."""
-    print(f"coopoc: {message}", file=sys.stderr)
 
 
 def without_outliers(problem: Problem, backend: str) -> Solution:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..paths import given_path, write
 from ..plugins import names
+from ..workers import say
 from . import store
 from .cell import Params
 from .results import SEED, Results, ego_by_run, whole
@@ -239,7 +239,7 @@ def reference(
     if write:
         made = measure(results, of.metrics)
         made.save(file)
-        print(f"coopoc: {len(made.numbers)} numbers are in {file}", file=sys.stderr)
+        say(f"{len(made.numbers)} numbers are in {file}")
         return 0
     known = Reference.load(file)
     changes = check(results, known, of.metrics)
