@@ -21,13 +21,14 @@ from torch import Tensor, nn
 from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.learned.checkpoint import Checkpoint, load
-from coopoc.learned.nets.gain_net import GainNet, Memory
+from coopoc.learned.engine.forward import State
+from coopoc.learned.nets.gain_net import GainNet
 from coopoc.paths import given_path, replaceable
 from coopoc.world.sensors import stream
 
-INPUTS = (*Memory._fields, "gnss", "velocity", "dt")
+INPUTS = (*State._fields, "gnss", "velocity", "dt")
 """Memory (B, 9) and (B, 3) m, fix (B, 3) m or NaN, velocity (B, 3) m/s, dt s without a dimension."""
-OUTPUTS = (*(f"next_{name}" for name in Memory._fields), "gain")
+OUTPUTS = (*(f"next_{name}" for name in State._fields), "gain")
 """Memory after the step, of which `next_x` (B, 3) m is the estimate, and the gain (B, 3, 3)."""
 AGREE = 1e-5
 """Largest difference of any number of any step from the net's own, m where it is a position."""
@@ -57,7 +58,7 @@ class Step(nn.Module):
         dt: Tensor,
     ) -> tuple[Tensor, ...]:
         """One step."""
-        memory = Memory(process, prior, innovation, x, x_before, prior_before, gnss_before)
+        memory = State(process, prior, innovation, x, x_before, prior_before, gnss_before)
         new, gain = self.net.step(memory, gnss, velocity, dt)
         return (*new, gain)
 

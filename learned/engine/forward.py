@@ -1,6 +1,6 @@
 """Compiled rollout of a GainNet along a drive: the arithmetic of `GainNet.step`, and the tape that backward reads."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,15 +39,16 @@ class Drives(NamedTuple):
 
 
 class State(NamedTuple):
-    """`gain_net.Memory` of L drives, changed in place: GRU states (L, 9) and positions (L, 3) m."""
+    """Memory of a net of L drives, arrays that are changed in place, or tensors: three GRU states (L, 9); estimate
+    (L, 3) m, the previous one, the last prior, the last fix."""
 
-    process: Floats
-    prior: Floats
-    innovation: Floats
-    x: Floats
-    x_before: Floats
-    prior_before: Floats
-    gnss_before: Floats
+    process: Any
+    prior: Any
+    innovation: Any
+    x: Any
+    x_before: Any
+    prior_before: Any
+    gnss_before: Any
 
 
 @storage

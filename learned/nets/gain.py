@@ -16,7 +16,6 @@ import copy
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -42,7 +41,7 @@ class Gain(nn.Module, ABC):
     @property
     def settings(self) -> Mapping[str, Any]:
         """The constructor's arguments that are attributes of the net: what makes a net of this shape again."""
-        return {name: getattr(self, name) for name in _arguments(type(self)) if hasattr(self, name)}
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters if hasattr(self, name)}
 
     @abstractmethod
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
@@ -108,9 +107,10 @@ class Recurrent(Gain):
             x0: (S, B, 3) m.
             dt: s, or (T,) s.
         """
-        rows = []
-        for s in range(len(theta)):
-            weights = {name: view[0] for name, view in named(theta[s : s + 1], self).items()}
+        rows, parameters = [], dict(self.named_parameters())
+        for s, flat in enumerate(theta):
+            parts = flat.split([p.numel() for p in parameters.values()])
+            weights = {name: part.view_as(p) for (name, p), part in zip(parameters.items(), parts, strict=True)}
             inputs = gnss[:, s].transpose(0, 1), velocity[:, s].transpose(0, 1), x0[s], dt
             rows.append(torch.func.functional_call(self, weights, inputs).transpose(0, 1))
         return torch.stack(rows, 1)
@@ -135,11 +135,6 @@ def size(field: str, value: object) -> int:
     8
     """
     return whole(field, value, 1, 1024, "The shipped nets have 5 to 40.")
-
-
-@cache
-def _arguments(kind: type[Gain]) -> tuple[str, ...]:
-    return tuple(inspect.signature(kind).parameters)
 
 
 def squared_error(x: Tensor, truth: Tensor) -> Tensor:
@@ -180,16 +175,3 @@ def unflatten(weights: Tensor, like: Net) -> Net:
     model = copy.deepcopy(like)
     nn.utils.vector_to_parameters(weights.detach().clone(), model.parameters())
     return model
-
-
-def named(theta: Tensor, like: nn.Module) -> dict[str, Tensor]:
-    """Views (S, ...) into flat weights, or gradients, (S, P) by the names of the parameters of `like`.
-
-    >>> named(torch.zeros(4, 9), nn.Linear(2, 3))["weight"].shape
-    torch.Size([4, 3, 2])
-    """
-    views, at = {}, 0
-    for name, parameter in like.named_parameters():
-        views[name] = theta[:, at : at + parameter.numel()].view(len(theta), *parameter.shape)
-        at += parameter.numel()
-    return views

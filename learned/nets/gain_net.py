@@ -1,6 +1,6 @@
 """GainNet: the three-GRU KalmanNet gain for a position state with a velocity control, by steps and compiled."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,22 +11,10 @@ from coopoc.errors import InputError
 
 from ..engine import backward, forward
 from ..engine.backward import Moments, Outcome, Update
-from ..engine.forward import Drives
+from ..engine.forward import Drives, State
 from ..engine.layers import CELLS, SHORTEST_LENGTH, STATE_SIZE, plan_of
 from ..training.clients import Batch
 from .gain import Recurrent, size
-
-
-class Memory(NamedTuple):
-    """State of the net: three GRU states (B, 9); estimate (B, 3) m, the previous one, the last prior, the last fix."""
-
-    process: Tensor
-    prior: Tensor
-    innovation: Tensor
-    x: Tensor
-    x_before: Tensor
-    prior_before: Tensor
-    gnss_before: Tensor
 
 
 class GainNet(Recurrent):
@@ -94,12 +82,12 @@ class GainNet(Recurrent):
         backward.descend(moments, plan, drives, truth, outcome, update)
         return outcome
 
-    def start(self, x0: Tensor) -> Memory:
+    def start(self, x0: Tensor) -> State:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""
         unit = torch.eye(STATE_SIZE, dtype=x0.dtype).flatten().expand(len(x0), CELLS)
-        return Memory(unit, torch.zeros_like(unit), unit, x0, x0, x0, x0)
+        return State(unit, torch.zeros_like(unit), unit, x0, x0, x0, x0)
 
-    def step(self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Memory, Tensor]:
+    def step(self, memory: State, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[State, Tensor]:
         """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3).
 
         The gain of a missing fix is zero. The compiled engine is tested against this text.
@@ -121,9 +109,9 @@ class GainNet(Recurrent):
 
         matrix = torch.where(missing, 0.0, gain).view(-1, STATE_SIZE, STATE_SIZE)
         x = x_prior + (matrix @ (fix - x_prior).unsqueeze(-1)).squeeze(-1)
-        new = Memory(process, posterior, innovation, x, memory.x, x_prior, fix)
+        new = State(process, posterior, innovation, x, memory.x, x_prior, fix)
         held = memory._replace(x=x, x_before=memory.x)
-        return Memory(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True))), matrix
+        return State(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True))), matrix
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (B, T, 3) m as in `Recurrent`; compiled where no gradient is wanted, in main memory."""
