@@ -1,8 +1,7 @@
 """Active constraints at a point: their multipliers, the directions that remain, and the largest violation."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,11 +15,10 @@ DEPENDENT = 1e-9
 """Singular value, of rows of length 1, below which they are dependent."""
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(NamedTuple):
     """All numbers of a problem that are bounded, at x.
 
-    Args:
+    Attributes:
         value: (rows,).
         lower: as `value`.
         upper: as `value`.
@@ -46,11 +44,10 @@ class Rows:
         return np.maximum(np.maximum(low, -high), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Active:
+class Active(NamedTuple):
     """The constraints that hold at x: equalities, and the inequalities with a multiplier.
 
-    Args:
+    Attributes:
         rows: all numbers that are bounded.
         multipliers: (rows,) of them, the gradient of the cost plus matrix^T multipliers vanishes at a minimum; at a
             lower bound they are <= 0, at an upper one >= 0.

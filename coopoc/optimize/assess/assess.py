@@ -1,9 +1,8 @@
 """Assessment of a point independently of its solver: covariance, free nodes, curvature, plausible cost."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import compress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy import inf, nan
@@ -48,11 +47,10 @@ INLIER_WEIGHT = 0.5
 """Weight rho' below which a robust loss rejects a measurement."""
 
 
-@dataclass(frozen=True, eq=False)
-class Assessment:
+class Assessment(NamedTuple):
     """Of a problem at x.
 
-    Args:
+    Attributes:
         cost: 1/2 sum of rho.
         gradient_norm: |J^T r|, or with constraints |J^T r + C^T multipliers|.
         covariance: (n, dof, dof) m^2, rad^2.
@@ -135,7 +133,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         if not quick and (covariance or not (variance * own < INFLATION).all()):
             cov, variance = _inverse(problem, x, "gauss-newton")
         if (variance * own < INFLATION).all():
-            return replace(ended(cov, step), newton=quick)
+            return ended(cov, step)._replace(newton=quick)
     if quick:
         return _unconstrained(problem, x, covariance)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
@@ -144,7 +142,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         flat = FLAT_CURVATURE + (steepness / scale + np.finfo(float).eps * abs(x).max()) / LEVER
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
-        return replace(unknown, unobservable=nodes)
+        return unknown._replace(unobservable=nodes)
     if bent is None:
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):

@@ -27,11 +27,10 @@ from ..model.problem import Problem, row_matrix
 from ..model.space import nearest_rotation
 
 
-@dataclass(frozen=True, eq=False)
-class Quadratic:
+class Quadratic(NamedTuple):
     """minimise 1/2 |A X|_F^2 over X (N, columns), X_B X_B^T = I on each Stiefel block, |X_B|_F = 1 on each sphere.
 
-    Args:
+    Attributes:
         rows: sparse A (M, N). The first `bound` rows of X are constrained, the others free positions.
         stiefel: (n, k) rows of X.
         sphere: (m, d / columns) rows of X.
@@ -102,7 +101,7 @@ class Quadratic:
         out = np.array(X)
         out[self.stiefel] = orthogonal(X[self.stiefel])
         s = X[self.sphere]
-        length = np.sqrt(np.square(s).sum(axis=(1, 2), keepdims=True))
+        length = norm(s, axis=(1, 2), keepdims=True)
         even = np.sqrt(1.0 / max(s[:1].size, 1))
         out[self.sphere] = np.where(length > 1e-12, s / np.maximum(length, 1e-12), even)
         return out

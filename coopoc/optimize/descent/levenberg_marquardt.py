@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,11 +49,10 @@ SLOW, SADDLE = 1e-2, 1e-4
 of the last step up to which an exact Hessian that is not positive definite is damped: J^T J leads to the saddle."""
 
 
-@dataclass(frozen=True, eq=False)
-class Arrival:
+class Arrival(NamedTuple):
     """Result of Levenberg-Marquardt.
 
-    Args:
+    Attributes:
         x: (n, ambient).
         iterations: factorisations.
         converged: the last step was below the tolerance, or its predicted decrease is rounding.

@@ -5,7 +5,6 @@ which the kernel in kernels/graphs/graph_tape.py runs for all measurements.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations_with_replacement
 from types import SimpleNamespace
@@ -319,13 +318,12 @@ def _operations() -> dict[int, Any]:
     return {getattr(ca, f"OP_{operation.name}"): operation for operation in Operation} | twice
 
 
-@dataclass(frozen=True, eq=False)
-class Linear:
+class Linear(NamedTuple):
     """A problem around x: per factor, whitened residuals and their derivative by the steps of its nodes.
 
     A robust factor's residual and derivatives carry the root of its weight rho'.
 
-    Args:
+    Attributes:
         residual: per factor (M, size).
         jacobian: per factor (M, size, arity dof).
         cost: 1/2 sum of rho.

@@ -87,7 +87,7 @@ def solve_gnc(
     problem = started(instance("problem", problem, Problem))
     one_of("start", start, Start)
     marked = mark(problem, candidates, groups)
-    marked = replace(marked, bound=bounds(marked, threshold))
+    marked = marked._replace(bound=bounds(marked, threshold))
     each, began, doubts = list[int](), clock(), tuple[str, ...]()
 
     def inner(part: Problem, steps: int = MAX_ITERATIONS) -> Floats:

@@ -3,7 +3,6 @@ squares and weights alternate while a nearly convex surrogate becomes the loss.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import islice
 from typing import NamedTuple
 
@@ -28,11 +27,10 @@ Candidates = Sequence[int | tuple[int, Sequence[int]]]
 """Factors by their index, all rows of them or some: [0, (2, [1, 3])]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Marked:
+class Marked(NamedTuple):
     """A problem of which M measurements are candidates.
 
-    Args:
+    Attributes:
         problem: whose candidates have no loss.
         factor: (M,) of each.
         row: (M,) of that factor.
@@ -280,7 +278,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     steps, search = 0, problem.search
     robust = {k: f.loss for k, f in enumerate(problem.factors) if f.loss is not None}
     marked = mark(problem.replace_unchecked(factors=tuple(unchecked(f, loss=None) for f in problem.factors)), [*robust])
-    marked = replace(marked, bound=np.array([robust[k].scale ** 2 for k in marked.factor.tolist()]))
+    marked = marked._replace(bound=np.array([robust[k].scale ** 2 for k in marked.factor.tolist()]))
 
     def inner(part: Problem) -> Floats:
         nonlocal steps
