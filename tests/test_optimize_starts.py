@@ -252,6 +252,15 @@ def test_a_far_x0_leads_as_low_as_the_truth_and_says_what_led_there(d, seed, bac
     assert "x0 leads to a higher minimum" in found.notes[-1]
 
 
+@pytest.mark.parametrize("off", [None, 0.3])
+def test_a_body_of_fine_odometry_that_ranges_place_has_a_start(off):
+    x = default_rng(0).uniform(0, 9, (6, 2))
+    problem = Problem(tuple("abcdef"), dimension=2, x0=off and x + off).add("position", range(4), x[:4], std=0.01)
+    problem = problem.add("displacement", (4, 5), x[5] - x[4], std=1e-4)
+    pairs = [(4, 0), (5, 1), (4, 2), (5, 3)]
+    assert solve(problem.add("range", pairs, norm([x[i] - x[j] for i, j in pairs], axis=1), std=0.05)).cost < 1e-9
+
+
 def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     """Bad odometry and random ranges: most steps move what is new alone; against the descent from the truth."""
     drive, rng, sizes = world(0, 2, 1, 300), default_rng(1), list[int]()

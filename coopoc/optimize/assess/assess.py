@@ -125,7 +125,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         far, gain = float(abs(dx).max(initial=0.0)), 0.5 * abs(float(gradient @ dx))
         return Assessment(cost, size, cov, far, predicted=gain, curved=curved, leverage=leverage)
 
-    own, cov = _largest(problem, values[entries.diagonal]), none
+    own, cov = largest(problem, values[entries.diagonal]), none
     step = variance = np.full(entries.size, inf)
     leverage = 0.0
     if held := cholesky.factor(values):
@@ -138,7 +138,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         return _unconstrained(problem, x, covariance)
     exact, bent = values if problem.linear else system.quadratic(x, "newton")[2], None
     if not problem.linear and np.isfinite(exact).all():
-        scale, steepness = own + (own == 0), _largest(problem, abs(gradient))
+        scale, steepness = own + (own == 0), largest(problem, abs(gradient))
         flat = FLAT_CURVATURE + (steepness / scale + np.finfo(float).eps * abs(x).max()) / LEVER
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
@@ -153,7 +153,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
     return ended(inverse, newton, True) if (2.0 * less < variance).any() else ended(cov, step)
 
 
-def _largest(problem: Problem, numbers: Floats) -> Floats:
+def largest(problem: Problem, numbers: Floats) -> Floats:
     """(m,) the largest of such numbers among the positions, or the turns, of the node of each unknown."""
     number, d = sparse(problem).entries.number, problem.dimension
     table = np.append(numbers, 0.0)[number]

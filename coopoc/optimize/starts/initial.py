@@ -12,6 +12,7 @@ from ...errors import InputError
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
 from ..algebra.sparse import sparse
+from ..assess.assess import largest
 from ..model.derivatives import linearise
 from ..model.factor import Factor, as_factor, bounded, stacked
 from ..model.measurements import converted_rows
@@ -20,8 +21,10 @@ from .graph_starts import parts, walk, with_points
 
 NUDGE_STD = 0.1
 """m or rad, standard deviation of such a move."""
-RIDGE = 1e-9
-"""1/m^2 on every point, so that one without information has a place to start from."""
+RIDGE = 1e-13
+"""Share of its information that every point has of where it is, above rounding: what nothing places stays there."""
+RIDGE_STEPS = 3
+"""After which points that are placed, by measurements however weak beside others, hardly feel it."""
 
 
 def initial_guess(problem: Problem) -> Floats:
@@ -45,11 +48,13 @@ def guessed(problem: Problem) -> tuple[Floats, bool]:
 def converted(problem: Problem, x: Floats) -> tuple[Floats, bool]:
     """Points (n, d) where vectors put them, from any x, and whether these touch all that can move."""
     system = sparse(problem)
-    _, gradient, values = system.quadratic(x, "converted")
+    values = system.quadratic(x, "converted")[2]
     own = values[system.entries.diagonal]
-    values[system.entries.diagonal] = own + RIDGE
-    system.cholesky.factor(values)
-    return system.retract(x, -system.cholesky.solve(gradient)), own.min(initial=np.inf) > 0.0
+    scale = largest(problem, own)
+    values[system.entries.diagonal] = own + RIDGE * scale + (scale == 0.0)
+    for _ in range(RIDGE_STEPS * system.cholesky.factor(values)):
+        x = system.retract(x, -system.cholesky.solve(system.quadratic(x, "converted")[1]))
+    return x, own.min(initial=np.inf) > 0.0
 
 
 def directed(problem: Problem, x: Floats) -> Floats:
