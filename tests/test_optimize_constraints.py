@@ -391,13 +391,19 @@ def test_vehicles_between_kerbs_end_as_low_as_from_the_truth(loss):
     assert any("another minimum" in note for note in far.notes)
 
 
-def test_a_shift_of_the_world_by_5000_km_changes_no_step():
+def test_a_robot_on_the_line_of_the_anchors_that_it_must_leave_is_drawn_off_it():
+    problem = Problem((*AB, "c"), dimension=2, x0=[[0, 0], [8, 0], [4, 0]], fixed=(0, 1))
+    problem = problem.add("position", "c", [4, 0], std=1.0)
+    assert solved(problem.constrain("range", [(0, 2), (1, 2)], lower=5.0)).cost == pytest.approx(4.5)
+
+
+def test_neither_5000_km_nor_millimetres_change_a_step():
     for seed in range(15):
         at, z = default_rng(seed).normal(size=(2, 2, 2)) * [[[10]], [[1]]]
         ends = []
-        for shift in (0.0, 5e6):
-            problem = Problem(AB, dimension=2).add("position", [*AB], at + z + shift, std=1.0)
-            problem = problem.constrain("position", "a", at[0] + shift - 0.1, at[0] + shift + 0.1)
-            ends.append(solve(problem.constrain("range", AB, upper=norm(at[0] - at[1]) - 0.5)))
-        assert ends[1].x - 5e6 == pytest.approx(ends[0].x, abs=1e-7)
-        assert ends[1].iterations <= ends[0].iterations + 2
+        for shift, unit in ((0.0, 1.0), (5e6, 1.0), (0.0, 1e-3)):
+            problem = Problem(AB, dimension=2).add("position", [*AB], unit * (at + z) + shift, std=unit)
+            problem = problem.constrain("position", "a", unit * (at[0] - 0.1) + shift, unit * (at[0] + 0.1) + shift)
+            ends.append(solve(problem.constrain("range", AB, upper=unit * (norm(at[0] - at[1]) - 0.5))))
+            assert (ends[-1].x - shift) / unit == pytest.approx(ends[0].x, abs=1e-7)
+            assert ends[-1].iterations <= ends[0].iterations + 2

@@ -56,48 +56,53 @@ def solver(
     >>> solve(problem.constrain("range", ("a", "b"), upper=7.0), "casadi").x.round(3)[:, 0]
     array([1., 8.])
     """
-    numbers, lower, upper = _numbers(problem, x)
-    space, free, count = problem.space, problem.movable, 0
-    equal, moving = int((lower == upper).sum()), int(free.sum())
-    if equal > moving:
-        raise InputError(
-            "constraints",
-            f"{equal} equalities",
-            f"must be at most the {moving} numbers that can move",
-            "Leave out those that follow from the others.",
-        )
     nlp = programme(structure_of(problem), int(max_iterations), get_ident())
-    multipliers = 0.0
+    space, free, count, multipliers = problem.space, problem.movable, 0, 0.0
     for _ in range(10):  # for poses again around the answer until it stays
+        numbers, lower, upper, unit = _numbers(problem, x)
+        if (equal := int((lower == upper).sum())) > len(unit):
+            raise InputError(
+                "constraints",
+                f"{equal} equalities",
+                f"must be at most the {len(unit)} numbers that can move",
+                "Leave out those that follow from the others.",
+            )
         end = nlp(p=numbers, lbg=lower, ubg=upper, lam_g0=multipliers)
         at, multipliers, stats = end["x"].toarray().ravel(), end["lam_g"], nlp.stats()
         status = stats["return_status"]
         step, count = np.zeros(free.shape), count + int(stats["iter_count"])
-        step[free] = at
+        step[free] = at * unit
         if np.isfinite(at).all():
             x = space.retract(x, _exponential(step))
-        if status in HOPELESS or not (space.has_rotation and abs(at).max(initial=0.0) > tolerance):
+        if status in HOPELESS or not (space.has_rotation and abs(step).max(initial=0.0) > tolerance):
             break
-        numbers, lower, upper = _numbers(problem, x)
     return SolverResult(x, count, status == HOPELESS[0], {"return_status": status})
 
 
-def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
-    """Parameters around x (n, ambient), and lower and upper sides of the numbers that are bounded and can change.
+def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Parameters around x (n, ambient), lower and upper sides of the numbers that are bounded and can change, and the
+    units of what can move.
 
-    Parameters are x, numbers of the factors and constraints, and last by what the cost is multiplied: 1 / max diag
-    J^T J. What is no angle counts from its value at x, so that far from the origin its digits are those of a step.
+    Parameters are x, numbers of the factors and constraints, by what the cost is multiplied, 1 / max diag J^T J in
+    those units, and the units. What is no angle counts from its value at x, so that far from the origin its digits are
+    those of a step, and in a length between the extent of the nodes and the least deviation: IPOPT's barrier and
+    tolerances are for numbers near 1.
     """
-    system = sparse(problem)
-    curvature = system.quadratic(x, "gauss-newton")[2][system.entries.diagonal].max(initial=1e-12)
+    system, d = sparse(problem), problem.dimension
+    diagonal = system.quadratic(x, "gauss-newton")[2][system.entries.diagonal]
+    at, along = problem.space.position(x), np.nonzero(problem.movable)[1] < d
+    extent = np.median(np.linalg.norm(at - np.median(at, axis=0), axis=1)) or 1.0
+    length = np.sqrt(extent) * diagonal[along].max(initial=extent**-2) ** -0.25
+    unit = np.where(along, length, 1.0)
     parts, sides = [x, *system.numbers], [np.empty((2, 0))]
     for c in problem.constraints:
-        item = as_factor(c)
+        item, far = as_factor(c), ~c.measurement.angles(d)
         (value,) = linearise(problem.space, [item], x).residual
-        item = unchecked(item, z=item.z + value * ~c.measurement.angles(problem.dimension))
+        item = unchecked(item, z=item.z + value * far, std=np.where(far, length, item.std))
         parts.append(numbers_of(item))
-        sides.append((np.stack([c.lower, c.upper]) - item.z)[:, steerable(c, problem.movable)])
-    return np.concatenate([*(part.ravel() for part in parts), [1.0 / curvature]]), *np.hstack(sides)
+        sides.append(((np.stack([c.lower, c.upper]) - item.z) / item.std)[:, steerable(c, problem.movable)])
+    parts += [1.0 / np.max(unit**2 * diagonal, initial=1e-12), unit]
+    return np.concatenate([*map(np.ravel, parts)]), *np.hstack(sides), unit
 
 
 def _exponential(step: Floats) -> Floats:
@@ -113,8 +118,10 @@ def programme(structure: Structure, max_iterations: int, thread: int) -> Any:
     """CasADi's nlpsol of a structure, its own for each thread, kept for the next problems that share it."""
     import casadi as ca
 
-    symbols, scale = expressions(structure), ca.SX.sym("scale")
-    nlp = {**symbols, "p": ca.vertcat(symbols["p"], scale), "f": scale * symbols["f"]}
+    nlp, scale = expressions(structure), ca.SX.sym("scale")
+    unit = ca.SX.sym("unit", nlp["x"].shape)
+    f, g = ca.substitute([scale * nlp["f"], nlp["g"]], [nlp["x"]], [unit * nlp["x"]])
+    nlp |= {"p": ca.vertcat(nlp["p"], scale, unit), "f": f, "g": g}
     options: Any = dict.fromkeys(("print_time", "calc_lam_p", "show_eval_warnings", "error_on_fail"), False)
     return ca.nlpsol("solver", "ipopt", nlp, options | {"ipopt": {**IPOPT, "max_iter": max_iterations}})
 
