@@ -25,7 +25,7 @@ class Status(Enum):
     MAX_ITERATIONS = "Stopped at the limit of iterations before a minimum: raise max_iterations or give a better x0."
     SADDLE = "At a stationary point that is no minimum: give an x0 to the side of it, where the cost falls."
     RANK_DEFICIENT = "Some points can move without changing the cost: measure them, or add a position factor."
-    INFEASIBLE = "No point was found that satisfies the constraints: relax the bounds that extras['violated'] names."
+    INFEASIBLE = "No point was found that satisfies the constraints: relax what extras['violated'] names, or move x0."
     FAILED = "The backend stopped before a minimum: give a better x0, or try another backend."
 
 

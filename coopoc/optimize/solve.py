@@ -45,7 +45,7 @@ DECREASE = 1e-10
 gain."""
 NEWTON_DECREASE = 1e-8
 """That of a Newton step where Gauss-Newton's step is below the tolerance: 1e-4 standard deviations away."""
-DRAWN_STEPS = 20
+DRAWN_STEPS = 50
 """From each random place, of problems with constraints."""
 ASTRAY_SHARE = 0.25
 """Share of the extent of points by which an x0 may err and its `smooth` way needs no random starts beside it."""
@@ -134,7 +134,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     result = backend.run(problem, start, options)
     if constraints:
         far = has_start and abs(problem.cost(given) - problem.cost(result.x)) > RIVAL_COST
-        if not whole and (far or searching):
+        bent = not all(c.measurement.linear for c in constraints)
+        if (bent and _violated(problem, result.x)) or (not whole and (far or searching)):
             problem, result = _drawn(problem, backend, options, result, has_start)
     elif has_start and not problem.linear:
         problem, result = _challenged(problem, backend, options, result, whole)
@@ -148,7 +149,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         extras |= {"start": search.start, "start_iterations": search.iterations, "start_seconds": search.seconds}
     if truth.active is not None and status is Status.INFEASIBLE:
         extras["violated"] = truth.active.violated
-    if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
+    stopped = not result.infeasible and iterations >= options.get("max_iterations", MAX_ITERATIONS)
+    if stopped and status in (Status.FAILED, Status.INFEASIBLE):
         status = Status.MAX_ITERATIONS
     expected, notes = judged(problem, x, truth)
     if np.isfinite(truth.cost):
@@ -201,7 +203,7 @@ def _drawn(
         return end.x
 
     def cost(x: Floats) -> float:
-        return sparse(problem).cost(x) if constraint_rows(problem, x).outside.max() <= FEASIBLE else np.inf
+        return np.inf if _violated(problem, x) else sparse(problem).cost(x)
 
     x, ends = drawn(
         chain(led, islice(scattered(problem, around), 0 if problem.poses else QUIET_DRAWS)), first.x, descend, cost
@@ -211,6 +213,10 @@ def _drawn(
         steps, start, first = steps + first.iterations, "drawn", backend.run(problem, x, options)
     search = search._replace(start=start, iterations=search.iterations + steps, notes=notes)
     return problem.replace_unchecked(search=search), first
+
+
+def _violated(problem: Problem, x: Floats) -> bool:
+    return bool(constraint_rows(problem, x).outside.max() > FEASIBLE)
 
 
 def _challenged(

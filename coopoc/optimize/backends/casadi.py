@@ -96,13 +96,14 @@ def _numbers(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats, Float
     unit = np.where(along, length, 1.0)
     parts, sides = [x, *system.numbers], [np.empty((2, 0))]
     for c in problem.constraints:
-        item, far = as_factor(c), ~c.measurement.angles(d)
+        item, angle = as_factor(c), c.measurement.angles(d)
+        units = np.where(angle, 1.0, length)[None]
         (value,) = linearise(problem.space, [item], x).residual
-        item = unchecked(item, z=item.z + value * far, std=np.where(far, length, item.std))
+        item = unchecked(item, z=item.z + value * ~angle, std=units)
         parts.append(numbers_of(item))
-        sides.append(((np.stack([c.lower, c.upper]) - item.z) / item.std)[:, steerable(c, problem.movable)])
-    parts += [1.0 / np.max(unit**2 * diagonal, initial=1e-12), unit]
-    return np.concatenate([*map(np.ravel, parts)]), *np.hstack(sides), unit
+        sides.append(((np.stack([c.lower, c.upper]) - item.z) / units)[:, steerable(c, problem.movable)])
+    scale = 1.0 / np.max(unit**2 * diagonal, initial=1e-12)
+    return np.concatenate([*map(np.ravel, parts), [scale], unit]), *np.hstack(sides), unit
 
 
 def _exponential(step: Floats) -> Floats:
