@@ -32,7 +32,7 @@ def test_ranges_end_where_scipy_ends(start):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"max_iterations": -1}, "must be a whole number"),
+        ({"max_iterations": -1}, "must be >= 0"),
         ({"tolerance": 0}, "must be a number > 0"),
         ({"structure": 0}, "is no option of casadi"),
     ],
