@@ -41,12 +41,12 @@ BYTE_LIMITS = (0.0, 300.0, 1000.0, 5000.0)
 """B/s, under which the best method is named."""
 
 
-def over(channel: str, k: int, **limits: Any) -> dict[str, Any]:
+def over(channel: str, k: int, **limits: Any) -> Where:
     """A channel as parameters or as a selection; its own rate, no cap and the nearest first, but for the limits."""
     return {"channel": channel, "max_neighbours": k, **IDEAL_CHANNEL, **limits}
 
 
-def under(cap: float, schedule: str, method: str, noise_model: str) -> dict[str, Any]:
+def under(cap: float, schedule: str, method: str, noise_model: str) -> Where:
     """The selection of a method under a cap and a schedule."""
     return of(method, noise_model, **over("ideal", MOST_NEIGHBOURS, cap_bytes_per_second=cap, schedule=schedule))
 

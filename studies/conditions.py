@@ -166,7 +166,7 @@ CORRELATED_GNSS = study(
 )
 
 
-def wrong(outliers: str = "", share: float = 0.0, start: float = 0.0, collude: bool = False) -> dict[str, Any]:
+def wrong(outliers: str = "", share: float = 0.0, start: float = 0.0, collude: bool = False) -> Where:
     """Outliers and an attack as parameters of a cell."""
     return {"outliers": outliers, "spoofed_share": share, "spoofed_from_s": start, "spoofed_collude": collude}
 

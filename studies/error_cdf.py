@@ -1,7 +1,6 @@
 """Learned gains among themselves and against fair filters: the distribution of the error (paper, Fig. 4)."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ def meaningful(p: Params) -> bool:
     return weights.trainable(p)
 
 
-def case(scenario: int, ratio: float) -> dict[str, Any]:
+def case(scenario: int, ratio: float) -> Where:
     """A case as a selection."""
     return {"scenario": scenario, "velocity_ratio": ratio}
 

@@ -60,8 +60,7 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     """
     files = [located(data, name) for name in roads(data)[task]]
     if task == "kitti":  # poses 3x4 of a camera (x right, z ahead) in the plane, and fixes of 2.5 m that are drawn once
-        poses = map(np.loadtxt, files)
-        ways = [np.insert(pose[:, [11, 3]], 2, 0.0, axis=1)[:, None] for pose in poses]
+        ways = [np.insert(pose[:, [11, 3]], 2, 0.0, axis=1)[:, None] for pose in map(np.loadtxt, files)]
         measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
         truth = Fleet(("car",), 0.1037 * np.arange(len(motion)), ways[1], motion, name="KITTI 00")
         drawn = observe(truth, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)

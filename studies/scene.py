@@ -39,7 +39,7 @@ def fleet(data: str) -> Fleet:
 
         return load_fleet(data)
     measurements = log.recording
-    nothing = np.full((len(measurements.t), len(measurements.ids), 3), np.nan)
+    nothing = np.full_like(measurements.gnss[0], np.nan)
     return log.truth or Fleet(
         measurements.ids, measurements.t, nothing, nothing, name=Path(data).stem, source="a log without truth"
     )

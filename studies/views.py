@@ -20,7 +20,7 @@ FigureView: TypeAlias = "Callable[[Results], Plot | None]"
 Rows: TypeAlias = Iterable[tuple[Sequence[Entry], Where]]
 
 
-def of(method: str, noise_model: str, /, **at: Any) -> dict[str, Any]:
+def of(method: str, noise_model: str, /, **at: Any) -> Where:
     """A method under a noise model, as parameters of a cell or as a selection."""
     return {**at, "method": method, "noise_model": noise_model}
 

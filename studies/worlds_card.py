@@ -133,7 +133,7 @@ def card_head(name: str) -> Row:
     return {"benchmark": VERSION, "method": name, "source": source, "versions": versions}
 
 
-def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", jobs: int = 1) -> dict[str, Any]:
+def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", jobs: int = 1) -> Row:
     """The card of a method on worlds seed..seed+count-1: columns of all worlds, and what they amount to.
 
     Args:
@@ -188,7 +188,7 @@ def _frame(rows: Sequence[Row]) -> "pd.DataFrame":
     return frame
 
 
-def summary(scored: "pd.DataFrame") -> dict[str, Any]:
+def summary(scored: "pd.DataFrame") -> Row:
     """Shares in % with Wilson's and means with bootstrap 95 % intervals over worlds, percentile, NEES and time.
 
     Args:
@@ -197,7 +197,7 @@ def summary(scored: "pd.DataFrame") -> dict[str, Any]:
     from scipy import stats
 
     sound, worse = scored[np.isfinite(scored["over_better"])], scored["over_better"] > WORSE_RATIO
-    made: dict[str, Any] = {"worlds": len(scored), "failed": len(scored) - len(sound)}
+    made: Row = {"worlds": len(scored), "failed": len(scored) - len(sound)}
     shares = {
         "worse_than_alone": scored["over_alone"] > WORSE_RATIO,
         "worse_than_better": worse,

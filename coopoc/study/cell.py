@@ -3,8 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,11 +14,10 @@ Params: TypeAlias = Mapping[str, Any]
 Row: TypeAlias = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """One point of the grid.
 
-    Args:
+    Attributes:
         params: its own parameters.
         settings: its own parameters and the settings of the study.
         name: `digest` of everything that changes the numbers.

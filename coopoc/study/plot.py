@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import style
@@ -18,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from ..paths import write
 from ..text import wrapped
+from .numbers import Where
 from .style import OWN_LOOKS, RC, line, look, title
 
 FIXED = {
@@ -28,8 +28,7 @@ FIXED = {
 """Formats, and metadata without a time or a version."""
 
 
-@dataclass(frozen=True, eq=False)
-class Plot:
+class Plot(NamedTuple):
     """A matplotlib figure and the caption that goes under it."""
 
     figure: Figure
@@ -72,12 +71,12 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
         yield figure, figure.subplots(rows, columns, **grid)
 
 
-def name_of(names: Mapping[str, Any]) -> str:
+def name_of(names: Where) -> str:
     """The method of a line; without one, its other names."""
     return str(names["method"]) if "method" in names else ", ".join(title(*item) for item in names.items())
 
 
-def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
+def strokes(names: Where) -> dict[str, Any]:
     """Line options of a method (colour, marker) and of a noise model (line style); a bound is dashed, with the past of
     newcomers dotted."""
     shown, model = look(name_of(names)), str(names.get("noise_model"))
@@ -86,7 +85,7 @@ def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
     return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
 
 
-def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None) -> None:
+def legend(axes: Axes, lines: Sequence[Where], words: Mapping[str, str] | None = None) -> None:
     """Draw the legend at the right: one entry per method and bound, and one per line style where noise models differ.
 
     Args:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -76,11 +76,10 @@ class Number:
         return json.dumps(dict(self.where), sort_keys=True, default=str), self.metric
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """A reference number and the same number now.
 
-    Args:
+    Attributes:
         was: the reference.
         now: its value now.
         difference: now less the reference, with what its tolerance and the noise of other runs allow.

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -20,15 +20,14 @@ from filelock import FileLock, Timeout
 from ..errors import InputError
 from ..formats.seals import UNSEALED, holds, sealed
 from ..paths import file_name, write
-from .cell import Cell, Row
+from .cell import Cell, Params, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
 FINISHED, FAILED = "cells", "failed"
 """Folders of the cells, by their last outcome."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Rows of a cell, or the reason why there are none."""
 
     cell: Cell
@@ -144,8 +143,8 @@ class Manifest:
     study: str
     question: str
     axes: Sequence[str]
-    settings: Mapping[str, Any]
-    cells: Mapping[str, Mapping[str, Any]]
+    settings: Params
+    cells: Mapping[str, Params]
     environment: Mapping[str, str]
 
     def save(self, folder: Path) -> None:

@@ -5,13 +5,12 @@ import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..evaluate.pictures import COLORS
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """Colour, marker and label of a method."""
 
     label: str

@@ -24,7 +24,7 @@ from .layers import (
     pack,
     unpack,
 )
-from .tile import Index, apart
+from .tile import Index, Indices, apart
 
 
 class Moments(NamedTuple):
@@ -173,7 +173,7 @@ def back(
     gnss: Floats,
     adjoints: Floats,
     begin: Index,
-    rows: tuple[Index, Index, Index],
+    rows: Indices,
     adjoint: State,
 ) -> None:
     """The gradient of the tape, zero before, from that of the estimates (T, S, B, 3); `rows` as in `forward.follow`.

@@ -23,7 +23,7 @@ from .layers import (
     tanh,
     unpack,
 )
-from .tile import Index, apart
+from .tile import Index, Indices, apart
 
 FOLLOWED = 16
 """Drives that are followed together, so that weights are fetched once for them."""
@@ -70,9 +70,7 @@ def forward(theta: Floats, plan: Plan, drives: Drives, x: Floats) -> None:
 
 
 @part
-def follow(
-    net: Net, tape: Floats, drives: Drives, x: Floats, rows: tuple[Index, Index, Index], state: State, keep: int
-) -> None:
+def follow(net: Net, tape: Floats, drives: Drives, x: Floats, rows: Indices, state: State, keep: int) -> None:
     """Estimates x[:, s, first : first + lanes] m of `rows` = s, first, lanes; keep: 1 keeps all steps on the tape, so
     many rows each, 0 the last."""
     s, first, lanes = rows
@@ -88,7 +86,7 @@ def follow(
 
 
 @part
-def start(state: State, x0: Floats, rows: tuple[Index, Index, Index]) -> None:
+def start(state: State, x0: Floats, rows: Indices) -> None:
     """The state before the first step: GRU states I, 0, I, all positions x0 m."""
     s, first, lanes = rows
     for lane in range(lanes):
@@ -101,16 +99,14 @@ def start(state: State, x0: Floats, rows: tuple[Index, Index, Index]) -> None:
 
 
 @part
-def missing(gnss: Floats, at: tuple[Index, Index, Index]) -> bool:
+def missing(gnss: Floats, at: Indices) -> bool:
     """Whether there is no fix at a step of a model's drive."""
     t, s, b = at
     return bool(np.isnan(gnss[t, s, b, 0]) and np.isnan(gnss[t, s, b, 1]) and np.isnan(gnss[t, s, b, 2]))
 
 
 @part
-def features(
-    drives: Drives, state: State, net: Net, tape: Floats, row: Index, t: Index, rows: tuple[Index, Index, Index]
-) -> None:
+def features(drives: Drives, state: State, net: Net, tape: Floats, row: Index, t: Index, rows: Indices) -> None:
     """Inputs of a step of GainNet: its old states, directions and lengths of four differences, and the innovation; a
     missing fix repeats the last."""
     real, at = tape.dtype.type, net.columns.changes
@@ -180,7 +176,7 @@ def blend(unit: Floats, new: Floats) -> None:
 
 
 @part
-def correct(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: tuple[Index, Index, Index]) -> None:
+def correct(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: Indices) -> None:
     """x <- x_prior + K (z - x_prior) and the new states of a lane; without a fix x <- x_prior and nothing else."""
     t, s, b = at
     gone, gain, residual, x = missing(drives.gnss, at), net.columns.gain, net.columns.residual, state.x[lane]

@@ -20,14 +20,13 @@ SHAPES = [(rows, vectors) for rows in (1, 2, 3, 4) for vectors in (1, 2)]
 """Rows and vectors of a tile: eight sums at most, beside which the 16 registers of AVX2 hold what they are made of."""
 Index: TypeAlias = int | np.integer[Any]
 """A number of a layer, field, row or column: Python's, or NumPy's from a table of them."""
+Indices: TypeAlias = tuple[Index, Index, Index]
 Block: TypeAlias = tuple[Floats, Index, Index]
 """A matrix in the memory of an array: the array, place of the first entry, distance of two rows, which may be 0."""
 
 
 @part
-def product(
-    out: Block, a: Block, across: Index, b: Block, start: Block, size: tuple[Index, Index, Index], floor: Any
-) -> None:
+def product(out: Block, a: Block, across: Index, b: Block, start: Block, size: Indices, floor: Any) -> None:
     """out (m, n) = max(start + a b, floor) of `size` m, n and k, terms of a sum; n is rounded up to whole vectors.
 
     The entries of a row of a (m, k) are `across` apart, those of the others 1.

@@ -127,8 +127,7 @@ class Federation:
 
     def after(self, rounds: int) -> Gain:
         """The global net after so many rounds, 0 being the start."""
-        last = len(self.history) - 1
-        rounds = whole("rounds", rounds, 0, last, "See history.")
+        rounds = whole("rounds", rounds, 0, len(self.history) - 1, "See history.")
         return unflatten(self.history[rounds].weights, self.like)
 
 

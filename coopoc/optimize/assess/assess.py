@@ -242,8 +242,7 @@ def _unobservable(
         moves = np.zeros(J.shape[1])
         ways_squared = np.square(basis @ turned)
         moves[moving] = ways_squared[:, abs(values) <= flat @ ways_squared].sum(1) + (lost & ~curved)
-    moves = moves.reshape(len(problem.names), -1).sum(1)
-    return tuple(compress(problem.names, moves > 1e-6))
+    return tuple(compress(problem.names, moves.reshape(len(problem.names), -1).sum(1) > 1e-6))
 
 
 def _evened(J: Any) -> Any:

@@ -107,8 +107,7 @@ class Problem:
             self.__dict__[field] = tuple(map(self.index, getattr(self, field)))
         self.__dict__["shown"] = self.index(self.shown) if self.names else 0
         self.__dict__["dimension"] = int(Space(self.dimension).dimension)  # 2 or 3
-        items = (*self.factors, *self.constraints)
-        for item in items:
+        for item in (*self.factors, *self.constraints):
             if not isinstance(item, Factor | Constraint):
                 hint = "Add measurements with Problem.add, constraints with Problem.constrain."
                 raise InputError("factors, constraints", shown(item), "must be Factors and Constraints", hint)
