@@ -100,15 +100,16 @@ def training(net: GainNet, pieces: Segments) -> list[Row]:
 
 def inference(net: GainNet, drive: Segments) -> list[Row]:
     """One drive of 900 steps, and 128 of them at once."""
-    batch = drive.batch(torch.zeros(1, 1, dtype=torch.long))
+    batch, theta = drive.batch(torch.zeros(1, 1, dtype=torch.long)), flatten([net])
     gnss, velocity, x0 = batch.gnss[:, 0].transpose(0, 1), batch.velocity[:, 0].transpose(0, 1), batch.x0[0]
-    many = [a.expand(128, *a.shape[1:]).contiguous() for a in (gnss, velocity, x0)]
-    wanted, length = Recurrent.forward(net, gnss, velocity, x0, batch.dt), gnss.shape[1]
+    one = batch.gnss, batch.velocity, batch.x0
+    many = [a.expand(*a.shape[:-2], 128, 3).contiguous() for a in one]
+    wanted, length = Recurrent.forward(net, gnss, velocity, x0, batch.dt).transpose(0, 1), gnss.shape[1]
     rows = [Row("plain torch, 1 drive", length, lambda: Recurrent.forward(net, gnss, velocity, x0, batch.dt), 0.0)]
-    for words, inputs in (("engine, 1 drive", (gnss, velocity, x0)), ("engine, 128 drives", many)):
-        found = net(*inputs, batch.dt)
-        error = float((found - wanted).abs().max())
-        rows.append(Row(words, length * len(found), lambda inputs=inputs: net(*inputs, batch.dt), error))
+    for words, inputs in (("engine, 1 drive", one), ("engine, 128 drives", many)):
+        found = net.rollout(theta, *inputs, batch.dt)[:, 0]
+        error, steps = float((found - wanted).abs().max()), length * found.shape[1]
+        rows.append(Row(words, steps, lambda inputs=inputs: net.rollout(theta, *inputs, batch.dt), error))
     return rows
 
 

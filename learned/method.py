@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
+from torch import Tensor, nn
 
 from coopoc.arrays import Bools, Floats, check_fields
 from coopoc.errors import InputError, shown
@@ -112,9 +112,11 @@ class LearnedGain(Alone):
         fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
         origin = start_of(self.x0, fixes[:, 0])[:, None]
         off, speeds = fixes[:, 1:] - origin, speeds[:, 1:]
+        model: Any = self.model
         with one_core(), torch.inference_mode():
-            moved = self.model(_lanes(off), _lanes(speeds), _lanes(0.0 * origin)[:, 0], recording.dt).numpy()
-        moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, 3), 2, 1)
+            theta = nn.utils.parameters_to_vector(model.parameters())[None]
+            moved = model.rollout(theta, _lanes(off), _lanes(speeds), _lanes(0.0 * origin)[0], recording.dt).numpy()
+        moved = np.moveaxis(moved.reshape(-1, recording.runs, len(columns), 3), 0, 1)
         moved = np.where(np.logical_or.accumulate(moves(off, speeds), axis=1), moved, 0.0)
         estimates = np.hstack([origin, origin + moved])
         unused = ("the net does not use the standard deviations that fixes state",) * bool(recording.fix_factor.size)
@@ -128,5 +130,6 @@ def moves(off: Floats, speeds: Floats) -> Bools:
 
 
 def _lanes(array: Floats) -> Tensor:
-    """(R E, T, 3) for the net of (R, T, E, 3)."""
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], 3), np.float32))
+    """(T, 1, R E, 3) for the net of (R, T, E, 3)."""
+    lanes = np.moveaxis(array, 1, 0).reshape(array.shape[1], 1, -1, 3)
+    return torch.from_numpy(np.ascontiguousarray(lanes, np.float32))

@@ -10,7 +10,7 @@ from torch import nn
 
 from coopoc import Fleet, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
-from coopoc.learned.nets.gain import Recurrent
+from coopoc.learned.nets.gain import flatten
 from coopoc.learned.training.schedule import one_core
 from coopoc.methods.track import Method
 
@@ -76,7 +76,8 @@ def test_wiring_and_features_as_published():
     with torch.no_grad():
         net.gain.weight.mul_(10)
         expected = Published(net)(gnss, velocity, data.x0[0], 0.1)
-        for found in (net(gnss, velocity, data.x0[0], 0.1), Recurrent.forward(net, gnss, velocity, data.x0[0], 0.1)):
+        compiled = net.rollout(flatten([net]), data.gnss, data.velocity, data.x0, 0.1)[:, 0].transpose(0, 1)
+        for found in (compiled, net(gnss, velocity, data.x0[0], 0.1)):
             torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 

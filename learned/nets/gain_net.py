@@ -113,15 +113,6 @@ class GainNet(Recurrent):
         held = memory._replace(x=x, x_before=memory.x)
         return State(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True))), matrix
 
-    def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (B, T, 3) m as in `Recurrent`; compiled where no gradient is wanted, in main memory."""
-        theta = nn.utils.parameters_to_vector(self.parameters())
-        wanted = torch.is_grad_enabled() and any(a.requires_grad for a in (theta, gnss, velocity, x0))
-        if wanted or theta.device.type != "cpu":
-            return super().forward(gnss, velocity, x0, dt)
-        lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)
-        return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
-
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (T, S, B, 3) m as in `Recurrent`; compiled where no gradient is wanted.
 
