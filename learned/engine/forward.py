@@ -1,6 +1,7 @@
 """Compiled rollout of a GainNet along a drive: the arithmetic of `GainNet.step`, and the tape that backward reads."""
 
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,17 +39,9 @@ class Drives(NamedTuple):
     dt: Floats
 
 
-class State(NamedTuple):
-    """Memory of a net of L drives, arrays that are changed in place, or tensors: three GRU states (L, 9); estimate
-    (L, 3) m, the previous one, the last prior, the last fix."""
-
-    process: Any
-    prior: Any
-    innovation: Any
-    x: Any
-    x_before: Any
-    prior_before: Any
-    gnss_before: Any
+State = namedtuple("State", "process prior innovation x x_before prior_before gnss_before")
+"""Memory of a net of L drives, arrays that are changed in place, or tensors: three GRU states (L, 9); estimate (L, 3)
+m, the previous one, the last prior, the last fix."""
 
 
 @storage

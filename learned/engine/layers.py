@@ -6,6 +6,7 @@ Products write whole vectors, so that a field is followed by room or by what is 
 """
 
 import math
+from collections import namedtuple
 from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
@@ -32,40 +33,15 @@ Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 """Names and shapes of a net's parameters, in the order of theta."""
 
 
-class Columns(NamedTuple):
-    """First column of each field of the tape, in their order: [process, evolved], [expected, observed], [prior,
-    innovation, gain] and [prior_copy, back] stand side by side, because layers read two of them at once. `changes`
-    holds the directions of the four changes: of the fix, innovation, evolution, update."""
-
-    changes: int
-    corrected: int
-    process_old: int
-    process_x: int
-    process_h: int
-    process_gates: int
-    process: int
-    evolved: int
-    prior_old: int
-    prior_x: int
-    prior_h: int
-    prior_gates: int
-    expected: int
-    observed: int
-    innovation_old: int
-    innovation_x: int
-    innovation_h: int
-    innovation_gates: int
-    prior: int
-    innovation: int
-    gain: int
-    hidden: int
-    prior_copy: int
-    back: int
-    posterior: int
-    residual: int
-    lengths: int
-
-
+Columns = namedtuple(
+    "Columns",
+    "changes corrected process_old process_x process_h process_gates process evolved prior_old prior_x prior_h "
+    "prior_gates expected observed innovation_old innovation_x innovation_h innovation_gates prior innovation gain "
+    "hidden prior_copy back posterior residual lengths",
+)
+"""First column of each field of the tape, in their order: [process, evolved], [expected, observed], [prior, innovation,
+gain] and [prior_copy, back] stand side by side, because layers read two of them at once. `changes` holds the directions
+of the four changes: of the fix, innovation, evolution, update."""
 ADJACENT_FIELDS = ("process", "expected", "prior", "innovation", "prior_copy")
 """Fields that end where the next one begins; the others have room for the last vector of what is written there."""
 _ROWS = (
