@@ -13,41 +13,32 @@ from coopoc.arrays import one_of
 from coopoc.errors import InputError, MissingLibraryError, said
 
 from .cells import Names
-from .log.units import QUATERNION, Rows, Summary, of_kinds
+from .log.units import BODY, QUATERNION, Rows, Summary, of_kinds
 
-ORIENTATION = "orientation.x orientation.y orientation.z orientation.w"
-POSE = "pose.position.x pose.position.y pose.position.z pose.orientation.x pose.orientation.y pose.orientation.z \
-pose.orientation.w"
 READ = {
     "sensor_msgs/msg/NavSatFix": "fix latitude longitude altitude status.status position_covariance_type \
 position_covariance",
-    "nav_msgs/msg/Odometry": "odometry twist.twist.linear.x twist.twist.angular.z twist.covariance",
-    "sensor_msgs/msg/Imu": f"imu angular_velocity.z angular_velocity_covariance {ORIENTATION} orientation_covariance",
-    "geometry_msgs/msg/PoseStamped": f"pose {POSE}",
+    "nav_msgs/msg/Odometry": "odometry twist.twist.linear.x twist.twist.linear.y twist.twist.linear.z \
+twist.twist.angular.z twist.covariance child_frame_id header.frame_id pose.pose.position.x pose.pose.position.y \
+pose.pose.position.z pose.pose.orientation.x pose.pose.orientation.y pose.pose.orientation.z pose.pose.orientation.w",
+    "sensor_msgs/msg/Imu": "imu angular_velocity.z angular_velocity_covariance orientation.x orientation.y \
+orientation.z orientation.w orientation_covariance",
+    "geometry_msgs/msg/PoseStamped": "pose pose.position.x pose.position.y pose.position.z pose.orientation.x \
+pose.orientation.y pose.orientation.z pose.orientation.w",
     "sensor_msgs/msg/Range": "range range min_range max_range",
 }
 """Type of a message -> what it is, and its fields that are read."""
 TRUTH_TOPICS = ("truth", "ground_truth", "groundtruth")
-FIELDS = {
-    "latitude": "latitude",
-    "longitude": "longitude",
-    "altitude": "height",
-    "position_covariance_0": "longitude_std",
-    "position_covariance_4": "latitude_std",
-    "position_covariance_8": "height_std",
-    "twist.twist.linear.x": "speed",
-    "twist.covariance_0": "speed_std",
-    "twist.twist.angular.z": "yaw_rate",
-    "twist.covariance_35": "yaw_rate_std",
-    "angular_velocity.z": "yaw_rate",
-    "angular_velocity_covariance_8": "yaw_rate_std",
-    "orientation_covariance_8": "qw_std",
-    "range": "range",
-    **{f"pose.position.{axis}": axis for axis in "xyz"},
-}
-"""Field, with the index in it -> kind, or the deviation whose variance it is; zeros mean unknown."""
-UNMEASURED = {"yaw_rate": "angular_velocity_covariance_0"} | dict.fromkeys(QUATERNION, "orientation_covariance_0")
-"""Field that is negative where a kind is not measured."""
+KINDS_OF_FIELDS = "altitude=height position_covariance_0=longitude_std position_covariance_4=latitude_std \
+position_covariance_8=height_std linear.x=speed linear.y=vy_body linear.z=vz_body angular.z=yaw_rate \
+twist.covariance_0=speed_std twist.covariance_7=vy_body_std twist.covariance_14=vz_body_std \
+twist.covariance_35=yaw_rate_std angular_velocity.z=yaw_rate angular_velocity_covariance_8=yaw_rate_std \
+orientation_covariance_8=qw_std orientation.x=qx orientation.y=qy orientation.z=qz orientation.w=qw position.x=x \
+position.y=y position.z=z"
+"""Field, with the index in it and without twist.twist and pose -> kind, or the deviation whose variance it is; zeros
+mean unknown."""
+UNMEASURED = {"angular_velocity_covariance_0": ["yaw_rate"], "orientation_covariance_0": QUATERNION}
+"""Field -> kinds that are not measured where it is negative."""
 
 
 def read_bag(
@@ -62,13 +53,14 @@ def read_bag(
 ) -> Rows:
     """Rows of the measurements in a bag.
 
-    The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part; of several
-    topics of PoseStamped the first part that differs, as in /vrpn_client_node/robot1/pose of motion capture. NavSatFix
-    gives latitude, longitude, height; Odometry the speed and yaw rate of its twist (its pose has a frame of its own and
-    is not used); Imu the yaw of its orientation as heading and the yaw rate, which goes before that of Odometry;
-    PoseStamped x, y, z in the frame of the map; Range, of topics that differ in two parts, the range from the first to
-    the second (/uwb/n_1/n_2/distance), which are the vehicles of the same numbers where none has their names. The truth
-    is the poses of PoseStamped or Odometry where the topic is `truth`, or a part of it is truth or ground_truth.
+    The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part; of
+    several topics of PoseStamped the first part that differs, as in /vrpn_client_node/robot1/pose of motion
+    capture. NavSatFix gives latitude, longitude, height; Odometry the velocity and yaw rate of its twist, in the
+    body, or in the local frame where child_frame_id is frame_id (its pose has a frame of its own and is not used);
+    Imu the yaw of its orientation as heading and the yaw rate, which goes before that of Odometry; PoseStamped x,
+    y, z in the frame of the map; Range, of topics that differ in two parts, the range from the first to the second
+    (/uwb/n_1/n_2/distance), which are the vehicles of the same numbers where none has their names. The truth is the
+    poses of PoseStamped or Odometry where the topic is `truth`, or a part of it is truth or ground_truth.
     Deviations are those of the covariances.
 
     Args:
@@ -97,24 +89,19 @@ def read_bag(
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
-    messages, behind, parts = dict[str, list[tuple[Any, ...]]](), list[float](), dict[str, Rows]()
+    messages, behind, parts = dict[str, list[Any]](), list[float](), dict[str, Rows]()
     folder = path.parent if path.suffix == ".db3" else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            topics = {c.topic: c.msgtype in READ and c.topic not in ignore for c in reader.connections}
             for topic in filter(None, [truth, *(name for name in ignore if name.startswith("/"))]):
-                one_of(f"{file}: topic", topic, sorted(topics))
-            wanted = [c for c in reader.connections if topics[c.topic]]
+                one_of(f"{file}: topic", topic, sorted({c.topic for c in reader.connections}))
             what, fields = {}, {}
-            for c in wanted:
-                what[c.topic], *fields[c.topic] = READ[c.msgtype].split()
-            of = _vehicles(what, truth, path.stem)
             for c in reader.connections:
-                topic = c.topic
-                if not topics[topic]:
-                    summary.unused[f"{file}: topic {topic} ({c.msgtype})"] += c.msgcount
-                elif what[topic] == "odometry" and of[topic][1]:
-                    fields[topic] = [f"pose.{field}" for field in POSE.split()]
+                if c.msgtype in READ and c.topic not in ignore:
+                    what[c.topic], *fields[c.topic] = READ[c.msgtype].split()
+                else:
+                    summary.unused[f"{file}: topic {c.topic} ({c.msgtype})"] += c.msgcount
+            wanted, of = [c for c in reader.connections if c.topic in what], _vehicles(what, truth, path.stem)
             for number, (c, received, raw) in enumerate(reader.messages(connections=wanted) if wanted else (), 1):
                 message: Any = reader.deserialize(raw, c.msgtype)
                 stamp, arrived = message.header.stamp, received * 1e-9
@@ -125,11 +112,12 @@ def read_bag(
         for topic, table in messages.items():
             frame = pd.DataFrame(table, columns=["number", "t", *fields[topic]]).set_index("number")
             for field in frame.columns[frame.columns.str.endswith("covariance")]:
-                frame = frame.join(pd.DataFrame(np.stack(frame[field].tolist()), frame.index).add_prefix(f"{field}_"))
+                frame = frame.join(
+                    pd.DataFrame(np.stack(frame.pop(field).tolist()), frame.index).add_prefix(f"{field}_")
+                )
             (vehicle, partner), true = of[topic]
             kinds_read = kinds_of(frame, true, summary, f"{file}: {topic}")
-            kinds_read = kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true))
-            parts[topic] = of_kinds(kinds_read, file)
+            parts[topic] = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), file)
     except InputError:
         raise
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all
@@ -184,11 +172,24 @@ def _by_number(frame: pd.DataFrame, summary: Summary) -> pd.DataFrame:
 
 
 def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> pd.DataFrame:
-    """The times t, kinds and deviations, in columns, of a topic with a column per field; NaN where there is none."""
-    if true:
-        topic = topic.rename(columns=lambda name: name.replace("pose.pose.", "pose."))
-    reason, finite = "poses that are not finite", topic.filter(regex="^(l.*itude|pose.position.*)$")
-    valid = pd.Series(np.isfinite(finite).all(axis=1), topic.index)
+    """The times t, kinds and deviations, in columns, of a topic with a column per field; NaN where there is none.
+
+    >>> topic = pd.DataFrame({"t": [0.0], "twist.twist.linear.x": 3.0, "twist.twist.linear.y": 4.0})
+    >>> kinds_of(topic, False, Summary(), "/odom").to_dict("records")
+    [{'t': 0.0, 'speed': 3.0, 'vy_body': 4.0}]
+    >>> frames = {"child_frame_id": "map", "header.frame_id": "map"}
+    >>> kinds_of(topic.assign(**frames), False, Summary(), "/odom")["vy"].item()
+    4.0
+    """
+    topic = topic.filter(regex="^(?!twist|child|header)" if true else r"^(?!pose\.(pose|orientation))")
+    frames = {*topic.filter(like="frame_id").to_numpy().ravel()}
+    kinds = dict(pair.split("=") for pair in KINDS_OF_FIELDS.split())
+    topic = topic.rename(columns=lambda name: kinds.get(re.sub(r"^(twist\.twist|pose(\.pose)?)\.", "", name), name))
+    for name, unmeasured in UNMEASURED.items():
+        if name in topic:
+            topic.loc[topic[name] < 0, unmeasured] = np.nan
+    reason = "poses that are not finite"
+    valid = topic.filter(regex="^(l.*itude|[xyz])$").abs().lt(np.inf).all(axis=1)
     if "status.status" in topic:
         reason, valid = "fixes that the receiver calls invalid", valid & (topic["status.status"] >= 0)
     elif "min_range" in topic:
@@ -196,16 +197,9 @@ def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> p
         valid = topic["range"].between(topic["min_range"].clip(0), most)
         reason = "ranges outside the sensor's stated limits"
     summary.refuse(reason, int((~valid).sum()), where)
-    topic = topic[valid]
-    made = {"t": topic["t"]} | {kind: topic[name] for name, kind in FIELDS.items() if name in topic}
-    for kind, axis in zip(QUATERNION, (POSE if true else ORIENTATION).split()[-4:], strict=True):
-        if axis in topic:
-            made[kind] = topic[axis]
-    for kind, name in UNMEASURED.items():
-        if name in topic and kind in made:
-            made[kind] = made[kind].where(topic[name] >= 0)
-    known_cov = topic.get("position_covariance_type", 1) != 0  # 0: the covariance is unknown
-    deviations = {
-        name: np.sqrt(each.where(known_cov & (each > 0))) for name, each in made.items() if name.endswith("_std")
-    }
-    return pd.DataFrame(made | deviations)
+    variances = topic.filter(regex="_std$").mul(topic.get("position_covariance_type", 1) != 0, axis=0)  # 0: unknown
+    topic[variances.columns] = variances.where(variances > 0) ** 0.5
+    if len(frames) == 1 and all(frames):
+        summary.assume("twists of {}, in the frame of their poses, are velocities in the local frame", where)
+        topic = topic.rename(columns=lambda name: name.replace("speed", "vx").replace("_body", ""))
+    return topic.loc[valid, topic.any() | ~topic.columns.isin([*BODY[1:], "vz"])]  # zero throughout: not measured

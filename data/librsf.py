@@ -58,8 +58,8 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
         f = pd.DataFrame(table, [*lines], names).assign(vehicle=vehicle, true=float(tag.startswith("point")))
         if tag == "odom2diff":
             both, track = f["first_cov"] + f["second_cov"], 2 * f["half_track"]
-            f = f.assign(speed=(f["first"] + f["second"]) / 2, yaw_rate=(f["second"] - f["first"]) / track)
-            f = f.assign(speed_cov=both / 4, yaw_rate_cov=both / track**2)
+            speed, yaw_rate = (f["first"] + f["second"]) / 2, (f["second"] - f["first"]) / track
+            f = f.assign(speed=speed, yaw_rate=yaw_rate, speed_cov=both / 4, yaw_rate_cov=both / track**2)
         f = f.assign(**{f"{name[:-3]}std": f[name].clip(0) ** 0.5 for name in map(str, f) if name.endswith("_cov")})
         if "partner" in f:
             f["partner"] = f["partner"].map("{:g}".format)

@@ -14,8 +14,8 @@ from .log.units import Rows, Summary, of_kinds
 
 KNOT, DAY_S = 1852 / 3600, 86400.0
 """m/s, and s."""
-LATITUDE, LONGITUDE = re.compile(r"\d\d[0-5]\d(\.\d*)?"), re.compile(r"\d{3}[0-5]\d(\.\d*)?")
-"""Degrees and minutes: the parser takes the last digits before the point for minutes, however many there are."""
+DEGREES = re.compile(r"\d\d[0-5]\d(\.\d*)?,\d{3}[0-5]\d(\.\d*)?")
+"""Degrees and minutes, which the parser takes from the last digits before the point, however many there are."""
 FIX = "latitude", "longitude", "height"
 MIN_COG_SPEED_M_S = 0.5
 """m/s, below which a course over ground is noise."""
@@ -81,7 +81,7 @@ class _Sentences:
             return f"NMEA sentences {s.msgID}"
         self._clock(s.time, getattr(s, "date", None))
         if s.msgID == "GGA":
-            if (s.lat or s.lon) and not (LATITUDE.fullmatch(s.payload[1]) and LONGITUDE.fullmatch(s.payload[3])):
+            if (s.lat or s.lon) and not DEGREES.fullmatch(f"{s.payload[1]},{s.payload[3]}"):
                 raise ValueError("latitude and longitude must be ddmm.mmm and dddmm.mmm")
             if not s.quality or s.lat == "" or s.lon == "":
                 return "fixes of quality 0"

@@ -253,7 +253,8 @@ def write_bag(path, fleet, ros, truth="truth", late=0.0, invalid=-1):
         for (step, t), ((column, what), topic) in product(enumerate(fleet.t), topics.items()):
             x, u = fleet.position[step, column], fleet.velocity[step, column]
             stamp = of("builtin_interfaces/Time", int(t), round((t - int(t)) * 1e9))
-            yaw, speed, unknown = float(np.arctan2(u[1], u[0])), np.hypot(*u[:2]), np.zeros(36)
+            crab, speed, unknown = 0.3 * column, np.hypot(*u[:2]), np.zeros(36)
+            yaw = float(np.arctan2(u[1], u[0])) - crab
             turned = of("geometry_msgs/Quaternion", 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
             upright = of("geometry_msgs/Pose", at(0, kind="Point"), of("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0))
             values: dict[str, list[Any]] = {
@@ -268,7 +269,7 @@ def write_bag(path, fleet, ros, truth="truth", late=0.0, invalid=-1):
                     of("geometry_msgs/PoseWithCovariance", upright, unknown),
                     of(
                         "geometry_msgs/TwistWithCovariance",
-                        of("geometry_msgs/Twist", at(speed), at(0)),
+                        of("geometry_msgs/Twist", at(speed * np.cos(crab), speed * np.sin(crab)), at(0)),
                         0.01 * np.eye(1, 36)[0],
                     ),
                 ],
