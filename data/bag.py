@@ -1,5 +1,6 @@
 """ROS 1 and 2 bags as rows of a log: NavSatFix, Odometry, Imu, PoseStamped and Range, one namespace per vehicle."""
 
+import os
 import re
 from collections.abc import Sequence
 from operator import attrgetter
@@ -53,15 +54,14 @@ def read_bag(
 ) -> Rows:
     """Rows of the measurements in a bag.
 
-    The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part; of
-    several topics of PoseStamped the first part that differs, as in /vrpn_client_node/robot1/pose of motion
-    capture. NavSatFix gives latitude, longitude, height; Odometry the velocity and yaw rate of its twist, in the
-    body, or in the local frame where child_frame_id is frame_id (its pose has a frame of its own and is not used);
-    Imu the yaw of its orientation as heading and the yaw rate, which goes before that of Odometry; PoseStamped x,
-    y, z in the frame of the map; Range, of topics that differ in two parts, the range from the first to the second
-    (/uwb/n_1/n_2/distance), which are the vehicles of the same numbers where none has their names. The truth is the
-    poses of PoseStamped or Odometry where the topic is `truth`, or a part of it is truth or ground_truth.
-    Deviations are those of the covariances.
+    The vehicle is the part in which topics of one kind differ (/fleet/car1/fix, /fleet/car2/fix); topics without such a
+    part are of one vehicle, named by their common first part, else as the bag. NavSatFix gives latitude, longitude,
+    height; Odometry the velocity and yaw rate of its twist, in the body, or in the local frame where child_frame_id is
+    frame_id (its pose has a frame of its own and is not used); Imu the yaw of its orientation as heading and the yaw
+    rate, which goes before that of Odometry; PoseStamped x, y, z in the frame of the map; Range the range between the
+    two vehicles of its topic (/car1/uwb/car2), or those of the same numbers where it has no name of one
+    (/uwb/n_1/n_2/distance). The truth is the poses of PoseStamped or Odometry where the topic is `truth`, or a
+    part of it is truth or ground_truth. Deviations are those of the covariances.
 
     Args:
         path: of the bag.
@@ -101,7 +101,7 @@ def read_bag(
                     what[c.topic], *fields[c.topic] = READ[c.msgtype].split()
                 else:
                     summary.unused[f"{file}: topic {c.topic} ({c.msgtype})"] += c.msgcount
-            wanted, of = [c for c in reader.connections if c.topic in what], _vehicles(what, truth, path.stem)
+            wanted, of = [c for c in reader.connections if c.topic in what], _vehicles(what, truth, path.stem, summary)
             for number, (c, received, raw) in enumerate(reader.messages(connections=wanted) if wanted else (), 1):
                 message: Any = reader.deserialize(raw, c.msgtype)
                 stamp, arrived = message.header.stamp, received * 1e-9
@@ -115,9 +115,9 @@ def read_bag(
                 frame = frame.join(
                     pd.DataFrame(np.stack(frame.pop(field).tolist()), frame.index).add_prefix(f"{field}_")
                 )
-            (vehicle, partner), true = of[topic]
-            kinds_read = kinds_of(frame, true, summary, f"{file}: {topic}")
-            parts[topic] = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), file)
+            (vehicle, partner, true), where = of[topic], f"{file}: {topic}"
+            kinds_read = kinds_of(frame, true, summary, where)
+            parts[topic] = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), where)
     except InputError:
         raise
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all
@@ -132,43 +132,64 @@ def read_bag(
         raise InputError(file, "0 messages", allowed, "Check the topics with: ros2 bag info.")
     rows = pd.concat(parts).sort_values("row", kind="stable")
     by, turns = rows.index.get_level_values(0).map(what), rows["kind"] == "yaw_rate"
-    rows = rows[~(turns & (by == "odometry") & rows["vehicle"].isin(rows["vehicle"][turns & (by == "imu")]))]
-    return _by_number(rows.reset_index(drop=True), summary)
+    return rows[~(turns & (by == "odometry") & rows["vehicle"].isin(rows["vehicle"][turns & (by == "imu")]))]
 
 
-def _vehicles(kinds: Names, truth: str, bag: str) -> dict[str, tuple[tuple[str, str], bool]]:
+def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str, tuple[str, str, bool]]:
     """Topic -> the vehicle and the partner that it names, and whether it is of the truth.
 
-    >>> topics = {"/mocap/red/pose": "pose", "/mocap/blue/pose": "pose", "/red/odom": "odometry"}
-    >>> [names for names, _ in _vehicles(topics, "", "drive").values()]
-    [('red', ''), ('blue', ''), ('red', '')]
+    Words in which topics of one kind differ name vehicles if a range has one, or most other topics of their namespace;
+    else they are sensors of one vehicle.
+
+    >>> one = {"/gps/fix": "fix", "/odom": "odometry", "/imu/data": "imu", "/ground_truth/odom": "odometry"}
+    >>> set(_vehicles(one, "", "drive", Summary()).values()) == {("drive", "", False), ("drive", "", True)}
+    True
+    >>> one = {"/car/front/fix": "fix", "/car/rear/fix": "fix", "/car/imu": "imu"}
+    >>> set(_vehicles(one, "", "drive", Summary()).values())
+    {('car', '', False)}
+    >>> two = {f"/fleet/{name}/{what}": what for name in ("red", "blue") for what in ("fix", "odometry", "imu")}
+    >>> two |= {"/red/uwb/blue": "range", "/red/sonar": "range"}
+    >>> for topic, names in _vehicles(two, "", "drive", Summary()).items():
+    ...     print(topic, *names)
+    /fleet/red/fix red  False
+    /fleet/red/odometry red  False
+    /fleet/red/imu red  False
+    /fleet/blue/fix blue  False
+    /fleet/blue/odometry blue  False
+    /fleet/blue/imu blue  False
+    /red/uwb/blue red blue False
+    /red/sonar drive red False
+    >>> anchors = {"/bot/odom": "odometry", "/a/pose": "pose", "/b/pose": "pose", "/uwb/a": "range", "/uwb/b": "range"}
+    >>> _vehicles(anchors, "", "drive", Summary())["/uwb/b"]
+    ('bot', 'b', False)
     """
     parts = {topic: topic.strip("/").split("/") for topic in kinds}
-    true = {topic: topic == truth or any(part.lower() in TRUTH_TOPICS for part in of) for topic, of in parts.items()}
-    names = {}
+    true = {topic for topic, of in parts.items() if topic == truth or any(part.lower() in TRUTH_TOPICS for part in of)}
+    own = {topic: of for topic, of in parts.items() if topic not in true and kinds[topic] != "range"}
+    names, ranged = set[str](), {part for topic, of in parts.items() if kinds[topic] == "range" for part in of}
+    for kind in {*kinds.values()}:
+        alike = [of for topic, of in own.items() if kinds[topic] == kind]
+        shared = os.path.commonprefix(alike)  # noqa: RUF071  (of words, not characters)
+        words = {of[len(shared)] for of in alike if len(of) > len(shared) + (kind != "pose")}
+        others = [of for topic, of in own.items() if kinds[topic] != kind and of[: len(shared)] == shared]
+        if words & ranged or not others or sum(not words.isdisjoint(of) for of in others) > len(others) / 2:
+            names |= words
+    spaces = {(of[:-1] or [bag])[0] for of in own.values() if names.isdisjoint(of)}
+    rest = spaces.pop() if len(spaces) == 1 else bag
+    numbered = {number: name for name in sorted(names) if (number := re.sub(r"\D", "", name))}
+    names |= {rest}
+    vehicles = {}
     for topic, of in parts.items():
-        kind = kinds[topic]
-        alike = [parts[other] for other in parts if (kinds[other], true[other]) == (kind, true[topic])]
-        differ = [k for k, part in enumerate(zip(*alike, strict=False)) if len(set(part)) > 1]
-        if kind == "range":
-            ends = (of[differ[0]], of[differ[1]]) if len(differ) > 1 else (of[0], of[-1])
-        else:
-            ends = of[differ[0] if differ and kind == "pose" else 0] if len(of) > 1 else bag, ""
-        names[topic] = ends, true[topic]
-    return names
-
-
-def _by_number(frame: pd.DataFrame, summary: Summary) -> pd.DataFrame:
-    """Rows whose ranges are between vehicles of the same numbers where none has the names of their ends."""
-    ranges = frame["kind"] == "range"
-    numbered = {re.sub(r"\D", "", name): name for name in frame["vehicle"][~ranges].unique()}
-    ends = {*frame["vehicle"][ranges], *frame["partner"][ranges]} - {*numbered.values()}
-    same = {
-        name: numbered[number] for name in sorted(ends) if (number := re.sub(r"\D", "", name)) in numbered and number
-    }
-    if same:
-        summary.assume(f"ranges name vehicles by their number: {', '.join(f'{a} is {b}' for a, b in same.items())}")
-    return frame.replace({"vehicle": same, "partner": same})
+        known, partner = [part for part in of if part in names], ""
+        vehicle = (known or [rest])[-1]
+        if kinds[topic] == "range":
+            for part in of if not known else ():
+                if name := numbered.get(re.sub(r"\D", "", part)):
+                    summary.assume("ranges name vehicles by their number: {}", f"{part} is {name}")
+                    known.append(name)
+            vehicle, partner, *_ = known if len(known) > 1 else dict.fromkeys([rest, *known, topic])
+        vehicles[topic] = vehicle, partner, topic in true
+    return vehicles
 
 
 def kinds_of(topic: pd.DataFrame, true: bool, summary: Summary, where: str) -> pd.DataFrame:
