@@ -29,7 +29,8 @@ pose.orientation.y pose.orientation.z pose.orientation.w",
     "sensor_msgs/msg/Range": "range range min_range max_range",
 }
 """Type of a message -> what it is, and its fields that are read."""
-TRUTH_TOPICS = ("truth", "ground_truth", "groundtruth")
+TRUTH_NAME = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
+"""Stem of a file, or part of a topic, that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
 KINDS_OF_FIELDS = "altitude=height position_covariance_0=longitude_std position_covariance_4=latitude_std \
 position_covariance_8=height_std linear.x=speed linear.y=vy_body linear.z=vz_body angular.z=yaw_rate \
 twist.covariance_0=speed_std twist.covariance_7=vy_body_std twist.covariance_14=vz_body_std \
@@ -60,8 +61,9 @@ def read_bag(
     frame_id (its pose has a frame of its own and is not used); Imu the yaw of its orientation as heading and the yaw
     rate, which goes before that of Odometry; PoseStamped x, y, z in the frame of the map; Range the range between the
     two vehicles of its topic (/car1/uwb/car2), or those of the same numbers where it has no name of one
-    (/uwb/n_1/n_2/distance). The truth is the poses of PoseStamped or Odometry where the topic is `truth`, or a
-    part of it is truth or ground_truth. Deviations are those of the covariances.
+    (/uwb/n_1/n_2/distance). The truth is the poses of PoseStamped or Odometry where the topic is `truth`, or differs
+    from it in the vehicle alone, or a part of it is named truth, ground_truth or gt. Deviations are those of the
+    covariances.
 
     Args:
         path: of the bag.
@@ -70,7 +72,7 @@ def read_bag(
         kinds: of tables.
         ignore: topics and kinds that are left out.
         stamps: times, those of the headers or those at which messages were "received".
-        truth: topic of the truth, whose rows are marked as true.
+        truth: topic of the truth of one vehicle, whose rows are marked as true, as are those of the others.
 
     Raises:
         InputError: no bag, none of these messages, or no such topic.
@@ -117,7 +119,7 @@ def read_bag(
                 )
             (vehicle, partner, true), where = of[topic], f"{file}: {topic}"
             kinds_read = kinds_of(frame, true, summary, where)
-            parts[topic] = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=float(true)), where)
+            parts[topic] = of_kinds(kinds_read.assign(vehicle=vehicle, partner=partner, true=true), where)
     except InputError:
         raise
     except Exception as error:  # of rosbags and pandas: a damaged file meets them all
@@ -144,12 +146,12 @@ def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str,
     >>> one = {"/gps/fix": "fix", "/odom": "odometry", "/imu/data": "imu", "/ground_truth/odom": "odometry"}
     >>> set(_vehicles(one, "", "drive", Summary()).values()) == {("drive", "", False), ("drive", "", True)}
     True
-    >>> one = {"/car/front/fix": "fix", "/car/rear/fix": "fix", "/car/imu": "imu"}
-    >>> set(_vehicles(one, "", "drive", Summary()).values())
-    {('car', '', False)}
+    >>> one = {"/car/front/fix": "fix", "/car/rear/fix": "fix", "/car/imu": "imu", "/vicon/car/pose": "pose"}
+    >>> set(_vehicles(one, "/vicon/car/pose", "drive", Summary()).values()) == {("car", "", False), ("car", "", True)}
+    True
     >>> two = {f"/fleet/{name}/{what}": what for name in ("red", "blue") for what in ("fix", "odometry", "imu")}
-    >>> two |= {"/red/uwb/blue": "range", "/red/sonar": "range"}
-    >>> for topic, names in _vehicles(two, "", "drive", Summary()).items():
+    >>> two |= {"/red/uwb/blue": "range", "/red/sonar": "range", "/vicon/red/pose": "pose", "/vicon/blue/pose": "pose"}
+    >>> for topic, names in _vehicles(two, "/vicon/red/pose", "drive", Summary()).items():
     ...     print(topic, *names)
     /fleet/red/fix red  False
     /fleet/red/odometry red  False
@@ -159,12 +161,14 @@ def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str,
     /fleet/blue/imu blue  False
     /red/uwb/blue red blue False
     /red/sonar drive red False
+    /vicon/red/pose red  True
+    /vicon/blue/pose blue  True
     >>> anchors = {"/bot/odom": "odometry", "/a/pose": "pose", "/b/pose": "pose", "/uwb/a": "range", "/uwb/b": "range"}
     >>> _vehicles(anchors, "", "drive", Summary())["/uwb/b"]
     ('bot', 'b', False)
     """
     parts = {topic: topic.strip("/").split("/") for topic in kinds}
-    true = {topic for topic, of in parts.items() if topic == truth or any(part.lower() in TRUTH_TOPICS for part in of)}
+    true = {topic for topic, of in parts.items() if topic == truth or any(map(TRUTH_NAME.fullmatch, of))}
     own = {topic: of for topic, of in parts.items() if topic not in true and kinds[topic] != "range"}
     names, ranged = set[str](), {part for topic, of in parts.items() if kinds[topic] == "range" for part in of}
     for kind in {*kinds.values()}:
@@ -178,17 +182,17 @@ def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str,
     rest = spaces.pop() if len(spaces) == 1 else bag
     numbered = {number: name for name in sorted(names) if (number := re.sub(r"\D", "", name))}
     names |= {rest}
-    vehicles = {}
+    vehicles, roles = {}, {topic: [part for part in of if part not in names] for topic, of in parts.items()}
     for topic, of in parts.items():
         known, partner = [part for part in of if part in names], ""
-        vehicle = (known or [rest])[-1]
+        vehicle = [rest, *known][-1]
         if kinds[topic] == "range":
             for part in of if not known else ():
                 if name := numbered.get(re.sub(r"\D", "", part)):
                     summary.assume("ranges name vehicles by their number: {}", f"{part} is {name}")
                     known.append(name)
             vehicle, partner, *_ = known if len(known) > 1 else dict.fromkeys([rest, *known, topic])
-        vehicles[topic] = vehicle, partner, topic in true
+        vehicles[topic] = vehicle, partner, topic in true or roles[topic] == roles.get(truth)
     return vehicles
 
 

@@ -1,6 +1,5 @@
 """A log of one's own -> Recording: what any reader finds in files, on steps, and the truth where there is some."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +30,7 @@ from ..assemble import (
     interpolate,
     longest_gap,
 )
-from ..bag import read_bag
+from ..bag import TRUTH_NAME, read_bag
 from ..cells import TABLES, Factors, Names, factors, headers
 from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
@@ -79,8 +78,6 @@ READERS: Mapping[str, Callable[..., Rows]] = {
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore, stamps, ...) -> its rows. A new format is one more
 entry."""
-TRUTH_NAME = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
-"""Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
 SEVERAL = "fixes of {} come from files side by side: of several antennas, or one is the truth, which truth= names"
 """What is assumed of two files with fixes of one vehicle."""
 SPARSE_SECONDS = 0.5
@@ -426,7 +423,7 @@ def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
         f"of {', '.join(sorted(names))}, not of {', '.join(sorted(moving))}" if names else "none",
         "needs at least one to place it in the local frame",
         f'{hint}anchors place it, read frame="body". Where files are named after sensors, give them a column vehicle, '
-        f"or a folder that is named after it. {summary.unread}".rstrip(),
+        f"or a folder that is named after it; of a bag, ignore= leaves out other topics. {summary.unread}".rstrip(),
     )
 
 
@@ -492,7 +489,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             f"{file}: column vehicle",
             ", ".join(vehicles),
             f"must name vehicles of the log: {', '.join(ids)}",
-            "Rename them, or leave the truth out.",
+            "Rename them, or leave the truth out: its file, or by ignore= its topic.",
         )
     if rows["t"].max() < 2 * DAY_S:  # seconds of the day, as of NMEA without a date, are of the day of the log
         rows = rows.assign(t=rows["t"] + DAY_S * round((steps.mean() - rows["t"].mean()) / DAY_S))
