@@ -204,6 +204,22 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
         assert error(by_fixes, method) < 1.3 * alone
 
 
+def test_a_heading_that_drifts_is_followed(tmp_path):
+    """By 2 degrees a minute, beside fixes alone: 13 m off where its error hardly changes."""
+    compass = COURSE + np.radians(2) * T / 60 + default_rng(0).normal(0, 0.01, len(T))
+    odometry = {"speed": SPEED, "speed_std": 0.1 + 0 * T, "heading": compass, "heading_std": 0.01 + 0 * T}
+    filter, fixes = co.CooperativeFilter(), log(tmp_path / "fixes", "car", 1.5, 10)[0]
+    assert error(log(tmp_path / "drifts", "car", 1.5, 10, **odometry)[0], filter) < 1.2 * error(fixes, filter)
+
+
+def test_ten_bearings_by_one_derived_heading_say_what_one_does(tmp_path):
+    """Its errors last."""
+    seen, std = {"speed": SPEED, "yaw_rate": RATE, "partner": "b", "bearing": 0.1 + 0 * T}, list[float]()
+    for bearing in (seen["bearing"], where(arange(len(T)) % 10, nan, 0.1)):
+        std.append(log(tmp_path, "car", 1.5, 10, **seen | {"bearing": bearing})[0].recording.sensors.heading_std)
+    assert std[0] == pytest.approx(10**0.5 * std[1], rel=0.01)
+
+
 def test_a_gyro_counts_as_its_noise_is_logged(tmp_path):
     """Beside a compass of 1 degree, on the way of a car; and what is known of no direction at the start is absent."""
     rng, speed = default_rng(1), where(T > 0, SPEED, 0.0)

@@ -127,6 +127,11 @@ def turned(f: Filter, k: int, moved: Numbers) -> Numbers:
     return scale * east, scale * north, moved[2]
 
 
+MOST_SURE, TINY = 30.0, 1e-12
+"""Times that errors of odometry change faster at most, as their squares are of their variances, since what is there
+drifts; least variance."""
+
+
 @part
 def drive(f: Filter, model: Model, k: int, moved: Numbers, dt: float) -> None:
     """Move a member by its odometry, whose errors decay."""
@@ -139,7 +144,8 @@ def drive(f: Filter, model: Model, k: int, moved: Numbers, dt: float) -> None:
     if not has(g, k, TURN):
         return
     i, n, level = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(f.ego[LEVEL + MOTIONS])
-    keep = math.exp(-level * level * dt / model.lasts)
+    sure = g.x[i] ** 2 / (g.p[i, i] + TINY) + g.x[i + 1] ** 2 / (g.p[i + 1, i + 1] + TINY)
+    keep = math.exp(-level * level * min(max(sure, 1.0), MOST_SURE) * dt / model.lasts)
     for c in range(2):
         for j in range(n):
             g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
