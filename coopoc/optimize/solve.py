@@ -78,7 +78,7 @@ def solve(
     Args:
         problem: what to solve.
         backend: a name of `backends()`, "folder/mine.py:BACKEND" or a Backend; None: gauss-newton, and where there are
-            constraints the first of osqp and casadi that holds them.
+            constraints the first of osqp and casadi that holds them and does not fail.
         throw: raise unless SOLVED; otherwise failure is data.
         covariance: whether to compute marginals; None: of up to COVARIANCE_NODES nodes.
         options: of the backend, such as max_iterations and tolerance (m).
@@ -102,9 +102,11 @@ def solve(
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if (factors := fused(problem.factors)) is not problem.factors:
         problem = problem.replace_unchecked(factors=factors)
-    solution = _solved(problem, chosen, options, wanted)
+    solution, lacks = _solved(problem, chosen, options, wanted), "gauss-newton cannot"
+    if problem.constraints and solution.status is Status.FAILED and backend is None and (other := next(able, None)):
+        solution, lacks = _solved(problem, other, options, wanted), f"{lacks}, {chosen.name} failed"
     if backend is None and chosen.name != DEFAULTS[0]:
-        solution = replace(solution, notes=(f"solved by {chosen.name}: gauss-newton cannot", *solution.notes))
+        solution = replace(solution, notes=(f"solved by {solution.backend}: {lacks}", *solution.notes))
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
     return solution

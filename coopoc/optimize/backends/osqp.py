@@ -6,8 +6,9 @@ steps.
 
 Settings matter: OSQP reports "solved" and can be a metre off when odometry weighs 5e5 times as much as GNSS. Scaling is
 off, the tolerance is tight, and every answer is checked against its own KKT conditions and repaired where it fails.
-Over-relaxation is off too: without constraints an iteration is then a proximal step with the weight sigma, and 1.6
-would make 40 of them out of one. A repair solves exactly for the active set that the iterations have found (polishing).
+The bounds weigh as much as what is known best (rho), else the active set is not found. Over-relaxation is off and the
+proximal weight sigma vanishes: without constraints an iteration is then a Newton step. A repair solves exactly for the
+active set that the iterations have found (polishing).
 """
 
 from typing import Any
@@ -25,6 +26,7 @@ from ..model.problem import Problem
 SETTINGS = {
     "scaling": 0,
     "alpha": 1.0,
+    "sigma": 1e-15,
     "eps_abs": 1e-9,
     "eps_rel": 1e-9,
     "check_termination": 1,
@@ -108,7 +110,7 @@ class Programme:
 
         if self._workspace is None:
             self._workspace, self._pattern.data = osqp.OSQP(), values
-            self._workspace.setup(self._pattern, q, self._rows, lower, upper, **SETTINGS)
+            self._workspace.setup(self._pattern, q, self._rows, lower, upper, rho=values.max(), **SETTINGS)
         else:
             self._polish(False)
             self._workspace.update(Px=values, q=q, l=lower, u=upper)
