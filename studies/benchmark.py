@@ -1,13 +1,13 @@
 """coopoc benchmark: a score card of any method on CL-Bench's tasks, and the table of all cards."""
 
 import json
-import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
+from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
@@ -98,11 +98,11 @@ def benchmark(
     failed = 0
     for name in methods:
         count = len({*tasks} or (by_name if data is None else {}) or runnable(name, by_name, data))
-        began, file = time.perf_counter(), card_file(name, out, seed, validation, count)
+        began, file = perf_counter(), card_file(name, out, seed, validation, count)
         made = card(name, by_name, data, tasks)
         failed += sum("failed" in row for row in made["tasks"])
         write(file, json.dumps(made, indent=1) + "\n")
-        say(f"{file}, {time.perf_counter() - began:.1f} s")
+        say(f"{file}, {perf_counter() - began:.1f} s")
         print(page([made]))
     if table:
         drawn_worlds, cards = (

@@ -1,7 +1,7 @@
 """coopoc paper: its studies with shared weights, and one report that answers their questions."""
 
-import time
 from pathlib import Path
+from time import perf_counter
 from typing import Annotated
 
 from tyro.conf import arg
@@ -30,7 +30,7 @@ def paper(
     from coopoc.study.report import report
     from coopoc.workers import say
 
-    began, failed, inputs = time.perf_counter(), 0, {"weights": str(out / "weights"), "data": data}
+    began, failed, inputs = perf_counter(), 0, {"weights": str(out / "weights"), "data": data}
     for number, name in enumerate(PAPER_STUDIES, start=1):
         say(f"stage {number} of {len(PAPER_STUDIES) + 1}: {name}")
         failed += run_study(name, out=out, jobs=jobs, settings=inputs, retry_failed=True).failed
@@ -44,6 +44,6 @@ def paper(
         lead=[LEAD.format(where=chosen)],
         cards={name: in_words(card(name)) for name in bundled},
     )
-    took = f"{(time.perf_counter() - began) / 60:.1f} min"
+    took = f"{(perf_counter() - began) / 60:.1f} min"
     say(f"done in {took}, {failed} failed cells. The report is {page}")
     return int(failed > 0)

@@ -1,10 +1,10 @@
 """Score card of a method on worlds: how often and by how much it is worse than being alone or a textbook filter."""
 
 import json
-import time
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -99,12 +99,12 @@ def run_worlds(methods: Sequence[str], out: Path, count: int, seed: int | None, 
         named_method(name)
     cards = []
     for name in methods:
-        began, file = time.perf_counter(), card_file(name, out, seed, validation, count)
+        began, file = perf_counter(), card_file(name, out, seed, validation, count)
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
         lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in cards[-1].items())
         write(file, "{\n" + ",\n".join(lines) + "\n}\n")  # a card is read by people and kept in a repository
         print(details(cards[-1]), end="\n\n")
-        say(f"{file}, {time.perf_counter() - began:.1f} s")
+        say(f"{file}, {perf_counter() - began:.1f} s")
     print(overview(cards))
     return int(any(card["failed"] for card in cards))
 

@@ -136,7 +136,7 @@ def test_pictures_show_names_as_text(kind):
     fleet = co.Fleet((name, "b"), t, position, np.gradient(position, 0.1, axis=0))
     rec = co.observe(fleet, co.Sensors(), co.V2X(max_neighbours=1))
     studied = Figure()
-    legend(studied.subplots(), [{"method": name}, {"method": "kalman"}])
+    legend(studied.subplots(), [{"method": name}, {"method": "kalman"}], {})
     figures = [co.plot_track(co.Kalman()(rec, [0]), fleet=fleet).figure, co.plot_recording(rec).figure, studied]
     texts = [*map(words, figures)]
     shown = re.sub(r"[^\w=]|_", "", name)[:6]

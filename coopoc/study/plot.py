@@ -85,7 +85,7 @@ def strokes(names: Where) -> dict[str, Any]:
     return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
 
 
-def legend(axes: Axes, lines: Sequence[Where], words: Mapping[str, str] | None = None) -> None:
+def legend(axes: Axes, lines: Sequence[Where], words: Mapping[str, str]) -> None:
     """Draw the legend at the right: one entry per method and bound, and one per line style where noise models differ.
 
     Args:
@@ -100,7 +100,7 @@ def legend(axes: Axes, lines: Sequence[Where], words: Mapping[str, str] | None =
     styles: dict[Any, list[str]] = {}
     for names in lines:
         method, model = name_of(names), str(names.get("noise_model") or "none")
-        text = look(method).label + (words or {}).get(method, "")
+        text = look(method).label + words.get(method, "")
         if method == "bound":
             text += f", {model}" if len(bounds) > 1 else ""
         elif "method" in names and model != "none" and model not in styles.setdefault(line(model), []):

@@ -5,11 +5,11 @@ publish the views.
 import itertools
 import os
 import sys
-import time
 import traceback
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
+from time import perf_counter
 from typing import Any, TypeAlias
 from urllib.parse import quote
 
@@ -72,13 +72,13 @@ def attempt(function: Function, cell: Cell) -> Outcome:
     >>> done.reason, 0.0 <= done.seconds < 60.0
     ('', True)
     """
-    start, rows, reason, trace = time.perf_counter(), None, "", ""
+    start, rows, reason, trace = perf_counter(), None, "", ""
     try:
         with threadpool_limits(limits=1):
             rows = _checked(function(cell.settings), cell)
     except (Exception, SystemExit) as error:
         reason, trace = map(uncontrolled, (f"{type(error).__name__}: {error}", traceback.format_exc()))
-    return Outcome(cell, rows, reason, trace, time.perf_counter() - start)
+    return Outcome(cell, rows, reason, trace, perf_counter() - start)
 
 
 def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:

@@ -1,9 +1,9 @@
 """Federated training: some rounds of local training on the clients that are asked, and of aggregation at a server."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import nan
+from time import perf_counter
 from typing import NamedTuple
 
 import torch
@@ -144,7 +144,7 @@ def federate(
     chosen_net = find("coopoc.nets", model) if isinstance(model, str) else model
     start = chosen_net() if isinstance(chosen_net, type) else chosen_net
     instance("model", start, Gain, "Give GainNet(), or its name.")  # type: ignore[type-abstract]
-    began, plan = time.perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
+    began, plan = perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
     names = _names(clients)
     plan.check(len(names))
     judge = Judge([[client.validation for client in clients], [client.long for client in clients]], start)
@@ -183,7 +183,7 @@ def federate(
             note,
         )
         history.append(row)
-    sizes, seconds = tuple(len(client.training) for client in clients), time.perf_counter() - began
+    sizes, seconds = tuple(len(client.training) for client in clients), perf_counter() - began
     return Federation(start, tuple(history), sizes, seconds, names)
 
 

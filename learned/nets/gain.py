@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from coopoc import Method
-from coopoc.arrays import Floats, whole
+from coopoc.arrays import Floats
 
 from ..engine.backward import Moments, Outcome, Update, advance
 from ..method import LearnedGain
@@ -126,15 +126,6 @@ class Recurrent(Gain):
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
         return LearnedGain(self, name, x0)
-
-
-def size(field: str, value: object) -> int:
-    """Number of units of a net; the card of a checkpoint may hold anything.
-
-    >>> size("hidden", 8)
-    8
-    """
-    return whole(field, value, 1, 1024, "The shipped nets have 5 to 40.")
 
 
 def squared_error(x: Tensor, truth: Tensor) -> Tensor:

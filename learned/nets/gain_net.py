@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import AnyArray, number, seed_of
+from coopoc.arrays import AnyArray, number, seed_of, whole
 from coopoc.errors import InputError
 
 from ..engine import backward, forward
@@ -14,7 +14,7 @@ from ..engine.backward import Moments, Outcome, Update
 from ..engine.forward import Drives, State
 from ..engine.layers import CELLS, SHORTEST_LENGTH, STATE_SIZE, plan_of
 from ..training.clients import Batch
-from .gain import Recurrent, size
+from .gain import Recurrent
 
 
 class GainNet(Recurrent):
@@ -44,7 +44,9 @@ class GainNet(Recurrent):
 
     def __init__(self, in_mult: int = 40, out_mult: int = 5, start_gain: float = 0.1, seed: int = 0) -> None:
         super().__init__()
-        self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
+        hint = "The shipped nets have 5 to 40."  # the card of a checkpoint may hold anything
+        self.in_mult = whole("in_mult", in_mult, 1, 1024, hint)
+        self.out_mult = whole("out_mult", out_mult, 1, 1024, hint)
         start_gain = number("start_gain", start_gain, -np.inf)
         wide, both, linear = STATE_SIZE * in_mult, 2 * CELLS, nn.Linear
         with torch.random.fork_rng(devices=[]):

@@ -1,10 +1,10 @@
 """fit: train a net on pieces, and keep the weights that validate best; fit_okf: the nine numbers of an OptimisedKF."""
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from math import inf, nan
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,7 @@ def fit(
         "long": validation if long is None else long,
     }.items():
         check_segments(field, value)
-    began, theta, draw = time.perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
+    began, theta, draw = perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
     plan, judge = schedule.plan(len(training), draw), Judge([[validation], *([] if long is None else [[long]])], model)
     history, so_far = [Progress(0, theta[0].clone(), nan, float(judge(theta)))], []
     due = set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist())
@@ -111,7 +111,7 @@ def fit(
             history.append(Progress(step, theta[0].clone(), mean, float(judge(theta))))
     if not stopped and min(row.validation_loss for row in history) == inf:
         stopped[0] = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
-    return Fit(model, tuple(history), stopped.get(0), time.perf_counter() - began)
+    return Fit(model, tuple(history), stopped.get(0), perf_counter() - began)
 
 
 def descend(
@@ -209,7 +209,7 @@ def fit_okf(
     >>> len(fit_okf(only.training, only.validation, steps=2)[1]["validation_loss"])
     2
     """
-    began, like = time.perf_counter(), NoiseParameters()
+    began, like = perf_counter(), NoiseParameters()
     data, judge = (padded([part.double()]) for part in (training, validation))
     logs = like.logs.detach().double().reshape(1, -1).clone().requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
@@ -226,7 +226,7 @@ def fit_okf(
         adam.step()
         fall.step()
     made = like.with_logs(best.view(3, 3)).calibrate([training])
-    return made, {"validation_loss": tuple(history), "seconds": time.perf_counter() - began}
+    return made, {"validation_loss": tuple(history), "seconds": perf_counter() - began}
 
 
 def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:

@@ -7,10 +7,10 @@ drops its rank: a bound that no point beats, and a start from which to refine.
 """
 
 import importlib
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -189,7 +189,7 @@ def shor(problem: Problem) -> Relaxation:
     >>> round(relaxed.lower_bound, 6), relaxed.tight
     (0.666667, True)
     """
-    began = time.perf_counter()
+    began = perf_counter()
     form = quadratic(problem)
     if form.bound > MAX_SHOR_ROWS:
         hint = "Solve it, and ask certify(problem, solution), which takes any number."
@@ -206,7 +206,7 @@ def shor(problem: Problem) -> Relaxation:
     X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
     # the refined point's own bound never exceeds Shor's but by what the solver lacks
     bound = max(bound, reduced.lower_bound(multipliers(form, X, reduced.times(X)))[0])
-    return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
+    return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, perf_counter() - began)
 
 
 @lru_cache(maxsize=64)

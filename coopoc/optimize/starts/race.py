@@ -42,8 +42,8 @@ def race(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
-    draws: bool = False,
-    reached: Floats | None = None,
+    draws: bool,
+    reached: Floats | None,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
