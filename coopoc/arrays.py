@@ -5,17 +5,17 @@ import sys
 from collections.abc import Mapping
 from dataclasses import fields
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeAlias, TypeVar, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError, shown, unknown
 
-Floats: TypeAlias = NDArray[np.floating[Any]]
-Ints: TypeAlias = NDArray[np.int64]
-Bools: TypeAlias = NDArray[np.bool_]
-AnyArray: TypeAlias = NDArray[Any]
+Floats = NDArray[np.floating[Any]]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+AnyArray = NDArray[Any]
 
 DTYPE_KINDS = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
 """Allowed kinds of dtype -> the name of one entry."""
@@ -23,7 +23,7 @@ TINY = 5e-324
 """The least positive number."""
 TWO_TURNS = 4 * np.pi
 """rad, beyond which an angle is in degrees or unwrapped."""
-Limits: TypeAlias = Mapping[str, tuple[float, float, str]]
+Limits = Mapping[str, tuple[float, float, str]]
 """Field -> least and largest value, and both in words."""
 
 

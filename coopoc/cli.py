@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint, version
 from io import TextIOWrapper
 from pathlib import Path
 from shutil import get_terminal_size
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
@@ -20,10 +20,10 @@ from . import plugins
 from .errors import InputError, MissingLibraryError, missing, unknown
 from .workers import say
 
-Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
-Folder: TypeAlias = Annotated[Path, arg(metavar="FOLDER")]
-Folders: TypeAlias = Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")]
-Format: TypeAlias = Literal["markdown", "csv", "latex", "html"]
+Command = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
+Folder = Annotated[Path, arg(metavar="FOLDER")]
+Folders = Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")]
+Format = Literal["markdown", "csv", "latex", "html"]
 
 _ABOUT = """usage: coopoc COMMAND [options]
 

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 Plot: TypeAlias = "plot.Plot"
 """For annotations: its module loads matplotlib, for which a mistake in --set need not wait."""
-TableView: TypeAlias = Callable[[Results], Table | None]
+TableView = Callable[[Results], Table | None]
 FigureView: TypeAlias = "Callable[[Results], Plot | None]"
-Rows: TypeAlias = Iterable[tuple[Sequence[Entry], Where]]
+Rows = Iterable[tuple[Sequence[Entry], Where]]
 
 
 def of(method: str, noise_model: str, /, **at: Any) -> Where:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import nan
@@ -17,8 +17,8 @@ from coopoc.world.spoofing import Spoofing, spoofed
 
 RUNS, EGOS = 4, 2
 """Noise draws and egos of a world."""
-Edit: TypeAlias = Callable[[Recording], Recording]
-Draws: TypeAlias = np.random.Generator
+Edit = Callable[[Recording], Recording]
+Draws = np.random.Generator
 
 
 class Scene(NamedTuple):
@@ -67,7 +67,7 @@ class Scene(NamedTuple):
         return (t >= start) & (t < start + max(length, self.fleet.dt)), f"{start:.0f} to {start + length:.0f} s"
 
 
-Made: TypeAlias = tuple[Scene, str]
+Made = tuple[Scene, str]
 
 
 def log_uniform(rng: Draws, low: float, high: float) -> float:

@@ -5,14 +5,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 from ..arrays import TINY, Floats, instance, number, whole
 from ..errors import InputError, MissingLibraryError, dependencies, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
 
-Options: TypeAlias = dict[str, Any]
+Options = dict[str, Any]
 MAX_ITERATIONS = 500
 """About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
 SOLVER_STEP_TOLERANCE = 1e-8

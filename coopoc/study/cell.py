@@ -3,15 +3,15 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
 
-Scalar: TypeAlias = str | int | float | bool | None
-Params: TypeAlias = Mapping[str, Any]
-Row: TypeAlias = dict[str, Any]
+Scalar = str | int | float | bool | None
+Params = Mapping[str, Any]
+Row = dict[str, Any]
 
 
 class Cell(NamedTuple):

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 Results: TypeAlias = "results.Results"
 """For annotations: its module loads pandas, for which a mistake in --set need not wait."""
-Where: TypeAlias = Mapping[str, Any]
+Where = Mapping[str, Any]
 """Column -> value, or a list of values."""
-Number: TypeAlias = Callable[[Results, Where], Any]
+Number = Callable[[Results, Where], Any]
 """An entry of a table for a selection; None where it was not run."""
 
 

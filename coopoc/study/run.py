@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
-from typing import Any, TypeAlias
+from typing import Any
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -36,7 +36,7 @@ from .results import Results
 from .store import Manifest, Outcome, locked
 from .study import Study, find_study
 
-Function: TypeAlias = Callable[[Params], list[Row]]
+Function = Callable[[Params], list[Row]]
 OF_WORKERS = {
     "TQDM_DISABLE": "1",  # read when tqdm is imported: one bar, ours, is enough
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1:glibc.malloc.mmap_threshold=268435456:"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .results import Results
     from .tables import Table
 
-Tracks: TypeAlias = Callable[[Params], Iterable[tuple[Any, ...]]]
+Tracks = Callable[[Params], Iterable[tuple[Any, ...]]]
 
 
 @dataclass(frozen=True, eq=False)

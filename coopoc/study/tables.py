@@ -8,7 +8,7 @@ from html import escape
 from math import floor, isfinite, isnan, log10
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 from tabulate import tabulate
 
@@ -20,8 +20,8 @@ from ..text import markdown, spreadsheet, tex, visible
 from .numbers import EQUAL_SHARE, Number, Results, Where, failures, sign
 from .style import METHODS, NOT_CAUSAL_SUFFIX, label, title, words
 
-Entry: TypeAlias = Interval | float | int | str | None
-Best: TypeAlias = Literal["min", "max"] | None
+Entry = Interval | float | int | str | None
+Best = Literal["min", "max"] | None
 UNRANKED = {METHODS["bound"].label, METHODS["oracle"].label, "oracle", "Difference"}
 """Row labels and titles (or parts of a title between commas) that are never the best."""
 _SMOOTHERS = METHODS["batch-smoother"].label, NOT_CAUSAL_SUFFIX

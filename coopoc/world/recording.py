@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from .plausible import MAX_POSITION, MAX_SPEED, MAX_YAW_RATE, headings, plausibl
 from .sensors import Sensors
 from .v2x import V2X
 
-Vehicles: TypeAlias = Sequence[int | str]
+Vehicles = Sequence[int | str]
 """Columns or ids."""
 
 

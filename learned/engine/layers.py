@@ -8,7 +8,7 @@ Products write whole vectors, so that a field is followed by room or by what is 
 import math
 from collections import namedtuple
 from functools import cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ FROM_X, FROM_H, GATES = PAD, 3 * PAD, 5 * PAD
 """Columns of W x, U h and the gates of a GRU from that of its old state."""
 ZEROS = 512
 """Zeros at the end of the matrices, as many as the longest row has entries."""
-Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
+Shapes = tuple[tuple[str, tuple[int, ...]], ...]
 """Names and shapes of a net's parameters, in the order of theta."""
 
 

@@ -4,7 +4,7 @@ A loop in Python's syntax keeps its sums in memory, and to call BLAS takes longe
 rows by 252 x 32 weights take plain numba 8 to 15 multiply-adds per ns, these tiles 25 to 40 (one core with AVX-512).
 """
 
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
@@ -18,10 +18,10 @@ REGISTER_BYTES = 64 if binding.get_host_cpu_features().get("avx512f") else 32
 """Of a vector register."""
 SHAPES = [(rows, vectors) for rows in (1, 2, 3, 4) for vectors in (1, 2)]
 """Rows and vectors of a tile: eight sums at most, beside which the 16 registers of AVX2 hold what they are made of."""
-Index: TypeAlias = int | np.integer[Any]
+Index = int | np.integer[Any]
 """A number of a layer, field, row or column: Python's, or NumPy's from a table of them."""
-Indices: TypeAlias = tuple[Index, Index, Index]
-Block: TypeAlias = tuple[Floats, Index, Index]
+Indices = tuple[Index, Index, Index]
+Block = tuple[Floats, Index, Index]
 """A matrix in the memory of an array: the array, place of the first entry, distance of two rows, which may be 0."""
 
 

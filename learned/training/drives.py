@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -78,7 +78,7 @@ class MeasuredDrives:
         return replace(self, ids=tuple(vehicles))
 
 
-Drives: TypeAlias = Fleet | MeasuredDrives
+Drives = Fleet | MeasuredDrives
 """What clients are made of: a fleet, whose measurements are simulated, or what was measured."""
 
 

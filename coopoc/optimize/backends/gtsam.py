@@ -10,7 +10,7 @@ is a Point2/3, a pose a Pose2/3.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import cycle
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ MAX_RESTARTS = 3
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
 POINT, POSE = False, True
-Names: TypeAlias = Mapping[tuple[bool, ...], str]
+Names = Mapping[tuple[bool, ...], str]
 """GTSAM's class by which of the nodes are poses."""
 WEIGHT_TOLERANCE = 1e-12
 """Share by which two weights may differ and count as equal."""
@@ -84,7 +84,7 @@ class Part(NamedTuple):
     root: Floats
 
 
-Form: TypeAlias = list[Part] | None
+Form = list[Part] | None
 """The parts of a factor, None if GTSAM has none with its objective."""
 
 
