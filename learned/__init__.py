@@ -8,19 +8,16 @@ from .method import LearnedGain
 from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
 from .nets.okf import NoiseParameters, OptimisedKF
-from .recipes import RECIPES, Recipe, Setting, load_method
+from .recipes import Recipe, Setting, load_method
 from .train import train_all
-from .training.clients import Client, Segments, clients
-from .training.drives import MeasuredDrives, measured_clients
-from .training.fit import Fit, fit
+from .training.clients import Segments, clients
+from .training.drives import MeasuredDrives
+from .training.fit import fit
 from .training.schedule import Schedule
 
 __all__ = [
-    "RECIPES",
     "Checkpoint",
-    "Client",
     "Federation",
-    "Fit",
     "Gain",
     "GainNet",
     "LearnedGain",
@@ -39,7 +36,6 @@ __all__ = [
     "ledger",
     "load",
     "load_method",
-    "measured_clients",
     "save",
     "train_all",
 ]

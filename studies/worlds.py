@@ -4,7 +4,7 @@ import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy import pi
@@ -16,7 +16,7 @@ from coopoc.world.body_frames import turned
 from .world_faults import EGOS, KINDS, OF_MOTION, OF_NEIGHBOURS, RUNS, WEIGHTS, Draws, Scene, log_uniform
 
 Split = Literal["test", "validation", "development"]
-SPLITS: tuple[Split, ...] = ("test", "validation", "development")
+SPLITS = get_args(Split)
 STEP_SECONDS = (0.05, 0.1, 0.1, 0.2, 0.5, 1.0)
 """s between two steps, each as probable as it stands here."""
 COUNTS = (0.2, 0.3, 0.3, 0.2)

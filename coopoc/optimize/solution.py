@@ -71,7 +71,7 @@ class Solution:
     names: tuple[str, ...]
     shown: int = 0
     unobservable: tuple[str, ...] = ()
-    space: Space = field(default_factory=Space)
+    space: Space = Space()
     violation: float = 0.0
     check_seconds: float = 0.0
     load_seconds: float = 0.0

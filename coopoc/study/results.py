@@ -21,7 +21,7 @@ from .style import METHODS, OWN_NAMES
 
 SEED = "train_seed"
 """Column of the training seed: means are taken over it, and intervals are not."""
-NO_VALUES = Interval(float("nan"), float("nan"), float("nan"), 0)
+NO_VALUES = Interval(np.nan, np.nan, np.nan, 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.linalg import eigh, eigvalsh
@@ -240,11 +240,10 @@ def semidefinite(
     return run
 
 
-@dataclass(frozen=True)
-class Certificate:
+class Certificate(NamedTuple):
     """Bounds of a solution's cost against the smallest cost of any point.
 
-    Args:
+    Attributes:
         certified: no point has a cost smaller by more than a share CERTIFIED_GAP of max(cost, 1).
         sentence: the verdict in words.
         cost: of the solution.

@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy import isfinite
 from numpy.linalg import cholesky, det, eigvalsh, inv, matrix_rank, norm
 from numpy.typing import ArrayLike
 
@@ -42,7 +43,7 @@ def whitening(kind: str, cov: ArrayLike) -> Floats:
     if array.ndim < 2 or array.shape[-1] != array.shape[-2]:
         raise InputError("cov", array.shape, "must be square matrices", "Give variances on the diagonal, m^2 or rad^2.")
     flat = array.reshape(-1, *array.shape[-2:])
-    mirrored = np.isclose(flat, flat.mT, rtol=1e-6, atol=1e-300) & np.isfinite(flat)
+    mirrored = np.isclose(flat, flat.mT, rtol=1e-6, atol=1e-300) & isfinite(flat)
     least = np.full(len(flat), np.nan)
     symmetric = np.asarray(mirrored.all(axis=(1, 2)))
     least[symmetric] = eigvalsh(flat[symmetric])[:, 0]
@@ -75,7 +76,7 @@ def check_values(measurement: Measurement, z: ArrayLike, count: int) -> Floats:
         raise InputError("z", array.shape, shape, "One row per row of nodes; a problem for each run.")
     dimension = fitting(measurement, array.shape[-1]) or 3
     hint = "Drop the measurement, or give it std = inf and any finite z."
-    refuse(field, array, ~np.isfinite(array), "must be finite", hint)
+    refuse(field, array, ~isfinite(array), "must be finite", hint)
     if measurement.compares_poses:
         check_rotations(field, array[:, dimension:].reshape(-1, dimension, dimension))
         return array
@@ -110,7 +111,7 @@ def check_std(measurement: Measurement, std: ArrayLike | float, shape: tuple[int
     refuse(field, wide, ~(wide > 0), "must be > 0", "Give standard deviations; infinity means no information.")
     kept = measurement.kept(3 if size == len(measurement.components) else 2)
     angles = wide[:, [measurement.components[k] in ("angle", "turn") for k in kept]]
-    refuse(field, angles, np.isfinite(angles) & (angles > np.pi), "must be <= pi rad", "Angles are in radians.")
+    refuse(field, angles, isfinite(angles) & (angles > np.pi), "must be <= pi rad", "Angles are in radians.")
     return frozen(wide)
 
 
@@ -121,7 +122,7 @@ def check_root(field: str, root: ArrayLike, shape: tuple[int, int]) -> Floats:
     if array.shape not in ((1, size, size), (*shape, size)):
         allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"
         raise InputError(field, array.shape, allowed, "Give one matrix, or one for each measurement.")
-    refuse(field, array, ~np.isfinite(array), "must be finite", "Invert a positive definite covariance.")
+    refuse(field, array, ~isfinite(array), "must be finite", "Invert a positive definite covariance.")
     return frozen(array)
 
 
@@ -260,7 +261,7 @@ class Factor:
     def measured(self) -> Ints:
         """(M,) numbers that carry information: the rank of W."""
         if self.std is not None:
-            return np.full(len(self.nodes), np.isfinite(self.std).sum(1))
+            return np.full(len(self.nodes), isfinite(self.std).sum(1))
         root, rank = self.root, np.full(len(self.nodes), self.size)
         flat = ~(abs(det(root)) > DEPENDENT_VOLUME * norm(root, axis=2).prod(axis=1))
         if flat.any():  # the rank takes as long as many steps of a solve
@@ -290,7 +291,7 @@ def _checked(item: "Factor | Constraint") -> Measurement:
         raise InputError("nodes", nodes[same][0].tolist(), "must be different points", hint)
     constants = checked(f"constants of {measurement.name}", [] if item.constants is None else item.constants)
     count, own = len(nodes), measurement.constants
-    if constants.shape not in ((own,), (1, own), (count, own)) or not np.isfinite(constants).all():
+    if constants.shape not in ((own,), (1, own), (count, own)) or not isfinite(constants).all():
         hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
         raise InputError("constants", constants.tolist(), f"must be {own} finite numbers for {measurement.name}", hint)
     wide = frozen(np.full((count, own), constants))
@@ -400,7 +401,7 @@ class Constraint:
             except ValueError:
                 allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
                 raise InputError(name, side.shape, allowed, "Give one bound per component.") from None
-            beyond = measurement.angles(self.dimension or 3) & np.isfinite(side) & (abs(side) > TWO_TURNS)
+            beyond = measurement.angles(self.dimension or 3) & isfinite(side) & (abs(side) > TWO_TURNS)
             refuse(f"{name} bound of {self.kind}", self.__dict__[name], beyond, "must be within 4 pi rad", DEGREES)
         wrong = ~(self.lower <= self.upper) | ((self.lower == self.upper) & ~bounded(self))  # of NaN, too
         allowed = "must be at most the upper one, and below infinity: lower <= upper"
@@ -421,7 +422,7 @@ class Constraint:
     @property
     def middle(self) -> Floats:
         """(M, size) that of two bounds of an angle, 0 elsewhere."""
-        both = np.isfinite([self.lower, self.upper]).all(0) & self.measurement.angles(self.dimension or 3)
+        both = isfinite([self.lower, self.upper]).all(0) & self.measurement.angles(self.dimension or 3)
         return np.asarray(np.where(both, [self.lower, self.upper], 0.0).mean(0))
 
     def __repr__(self) -> str:
@@ -438,7 +439,7 @@ def as_factor(constraint: Constraint) -> Factor:
 
 def bounded(constraint: Constraint) -> Bools:
     """(M, size) True where a side is finite."""
-    return np.isfinite(constraint.lower) | np.isfinite(constraint.upper)
+    return isfinite(constraint.lower) | isfinite(constraint.upper)
 
 
 def steerable(constraint: Constraint, movable: Bools) -> Bools:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations, compress
 
 import numpy as np
+from numpy import flatnonzero, isfinite, zeros
 from numpy.linalg import norm, pinv, svd
 
 from ...arrays import Bools, Floats, Ints
@@ -43,9 +44,9 @@ def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools
     from scipy.sparse.csgraph import dijkstra
 
     edges, n, d = graph.relative_pose, len(graph.names), graph.dimension
-    position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
-    is_reached = np.zeros(n, bool)
-    length, rows = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12, np.flatnonzero(used)
+    position, rotation = zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
+    is_reached = zeros(n, bool)
+    length, rows = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12, flatnonzero(used)
     which = rows[np.argsort(length[rows], kind="stable")]
     ends = np.stack([edges.nodes[which], edges.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
     key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
@@ -55,7 +56,7 @@ def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools
         if is_reached[root]:
             continue
         distance, before = dijkstra(lengths, indices=root, return_predecessors=True)
-        reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
+        reached = flatnonzero(isfinite(distance) & (before >= 0))
         before = before.astype(int)  # SciPy's 32 bits hold no product of two numbers beyond 46,340
         taken = np.searchsorted(key, before[reached] * n + reached)
         moved, turn = edges.position[edge[taken]], edges.rotation[edge[taken]]
@@ -65,7 +66,7 @@ def walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools
         index = np.full(n, -1)
         index[reached] = np.arange(len(reached))
         before = index[before[reached]]
-        while (on := np.flatnonzero(before >= 0)).size:  # to poses as the root sees them: pointers jump
+        while (on := flatnonzero(before >= 0)).size:  # to poses as the root sees them: pointers jump
             by = before[on]
             moved[on] = moved[by] + (turn[by] @ moved[on, :, None])[..., 0]
             turn[on] = turn[by] @ turn[on]
@@ -210,13 +211,13 @@ def averaging(
     weight, row = 1.0 / variance, np.arange(len(nodes))
     sign = np.repeat([-1.0, 1.0], len(nodes))
     gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
-    pinned = np.zeros(n)  # of what may be shifted as a whole any weight holds a node where it is
+    pinned = zeros(n)  # of what may be shifted as a whole any weight holds a node where it is
     pinned[firsts(parts(n, nodes), held)] = weight.max(initial=1e-300)
     factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(pinned))
 
     def moves(error: Floats) -> Floats:
         if factored is None:
-            return np.zeros((n, error.shape[1]))
+            return zeros((n, error.shape[1]))
         return -columns_solved(factored, gap.T @ (weight[:, None] * error))
 
     return moves, factored
@@ -228,7 +229,7 @@ def file(graph: Graph) -> Floats:
     Raises:
         InputError: a vertex without a position.
     """
-    unknown = ~np.isfinite(graph.position).all(1)
+    unknown = ~isfinite(graph.position).all(1)
     if unknown.any():
         needs = f"needs a position of {graph.names[int(unknown.argmax())]} in the file"
         raise InputError("start", "'file'", needs, 'Use start="odometry".')
@@ -241,9 +242,9 @@ STARTS = {"odometry": chained, "file": file, "tree": tree}
 def contenders(graph: Graph) -> tuple[str, ...]:
     """The starts that may differ on a graph, cheapest first: without loops all are chained odometry, but the file's
     vertices where they are a guess and not the truth."""
-    from_file = ("file",) if graph.guess and np.isfinite(graph.position).all() else ()
+    from_file = ("file",) if graph.guess and isfinite(graph.position).all() else ()
     loops = len(graph.relative_pose.nodes) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
-    moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
+    moved = len(graph.names) - len(np.setdiff1d(flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
     return (*("tree",) * (loops >= moved), "odometry", *from_file)
 
 
@@ -256,7 +257,7 @@ def _own(graph: Graph) -> Bools:
 def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     """Fixed poses, those with a prior at that, then each robot's first, and the first of each part that its odometry
     joins."""
-    priors, poses = graph.pose_prior, np.flatnonzero(graph.is_pose)
+    priors, poses = graph.pose_prior, flatnonzero(graph.is_pose)
     roots = [(int(i), graph.position[i], graph.rotation[i]) for i in anchors(graph) if graph.is_pose[i]]
     roots += [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
     part = parts(len(graph.names), graph.relative_pose.nodes[_own(graph)])[poses]
@@ -266,7 +267,7 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     around = float(graph.ranges.distance.mean()) if len(graph.ranges) else 1.0
     for k, node in enumerate(firsts):
         angle = 2.0 * np.pi * k / len(firsts)
-        if np.isfinite(graph.position[node]).all() and (graph.guess or k < len(robots)):
+        if isfinite(graph.position[node]).all() and (graph.guess or k < len(robots)):
             roots.append((node, graph.position[node], graph.rotation[node]))
         else:
             at = around * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -276,7 +277,7 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
 
 def anchors(graph: Graph) -> Ints:
     """Fixed vertices of which the graph has the place."""
-    return graph.fixed[np.isfinite(graph.position[graph.fixed]).all(1)]
+    return graph.fixed[isfinite(graph.position[graph.fixed]).all(1)]
 
 
 def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
@@ -287,7 +288,7 @@ def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools)
     for (i, j), at in zip(graph.relative_point.nodes.tolist(), graph.relative_point.position, strict=True):
         if not placed[j]:
             position[j], placed[j] = position[i] + rotation[i] @ at, True
-    for j in np.flatnonzero(~placed & ~graph.is_pose).tolist():
+    for j in flatnonzero(~placed & ~graph.is_pose).tolist():
         others, ranges = _ranged(graph, j, placed)
         if len(others):
             position[j] = trilaterate(position[others], ranges)
@@ -297,7 +298,7 @@ def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools)
 
 def _ranged(graph: Graph, point: int, placed: Bools) -> tuple[Ints, Floats]:
     """The known nodes to which a point has ranges, and these."""
-    rows = np.flatnonzero((graph.ranges.nodes == point).any(1))
+    rows = flatnonzero((graph.ranges.nodes == point).any(1))
     others = graph.ranges.nodes[rows].sum(1) - point
     return others[placed[others]], graph.ranges.distance[rows[placed[others]]]
 
@@ -315,20 +316,20 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     """
     x0 = np.asarray(problem.x0)
     space, x, n = problem.space, x0.copy(), len(graph.names)
-    solved, ranges, iterations, whole = np.zeros(n, bool), np.zeros(n, int), 0, 0
+    solved, ranges, iterations, whole = zeros(n, bool), zeros(n, int), 0, 0
     last, count = solved, _stages(graph)
     for stage in range(count):
-        used = np.zeros(n, bool)
+        used = zeros(n, bool)
         for places in graph.robots.values():
             new = places[: int(np.ceil((stage + 1) / count * len(places)))]
             used[new] = True
             old = new[solved[new]]
             if len(old) and len(old) < len(places):
                 x[places[len(old) :]] = carried(space, x0[places[len(old) :]], x0[old[-1]], x[old[-1]])
-        joins = np.zeros(n, bool)
+        joins = zeros(n, bool)
         for edges in (graph.relative_point, graph.point_prior):
             joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
-        for point in np.flatnonzero(~graph.is_pose & ~joins).tolist():
+        for point in flatnonzero(~graph.is_pose & ~joins).tolist():
             others, distance = _ranged(graph, point, used)
             joins[point] = len(others) >= HOLDING * space.dimension + 1
             if joins[point] and len(others) >= 2 * ranges[point]:
@@ -349,7 +350,7 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
 def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Problem, Bools]:
     """The problem from x (n, ambient) of the nodes that are `free` (n,) with their neighbours among the `used`, which
     are fixed, and which nodes it has."""
-    factors = [taken(f, np.flatnonzero(used[f.nodes].all(1) & free[f.nodes].any(1))) for f in problem.factors]
+    factors = [taken(f, flatnonzero(used[f.nodes].all(1) & free[f.nodes].any(1))) for f in problem.factors]
     kept, still = free.copy(), ~free
     kept[stacked(f.nodes.ravel() for f in factors)] = True
     still[list(problem.fixed)] = True
@@ -358,7 +359,7 @@ def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Probl
         names=tuple(compress(problem.names, kept)),
         factors=tuple(unchecked(f, nodes=number[f.nodes]) for f in factors if len(f.nodes)),
         poses=tuple(number[[k for k in problem.poses if kept[k]]].tolist()),
-        fixed=tuple(np.flatnonzero(still[kept]).tolist()),
+        fixed=tuple(flatnonzero(still[kept]).tolist()),
         x0=x[kept],
     )
     return part, kept
