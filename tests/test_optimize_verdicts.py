@@ -106,11 +106,11 @@ def test_ranges_that_do_not_meet_are_noted():
     assert "explains 0" in found.notes[-1]
 
 
-@pytest.mark.parametrize("std", [1e-5, 1e-6])
-def test_odometry_of_micrometres_beside_a_fix_of_a_metre_is_known(std):
-    problem = Problem([*"abc"]).add("position", ["a", "c"], [[0, 0, 0], [2, 1, 0]], std=1.0)
+@pytest.mark.parametrize(("std", "fix"), [(1e-5, 1.0), (1e-6, 1.0), (1e-4, 1e3)])
+def test_odometry_of_micrometres_beside_a_fix_of_a_metre_is_known(std, fix):
+    problem = Problem([*"abc"]).add("position", ["a", "c"], [[0, 0, 0], [2, 1, 0]], std=fix)
     found = solve(problem.add("displacement", [(0, 1), (1, 2)], [[1, 0, 0], [1, 0, 0]], std=std))
-    assert found.covariance[1].diagonal() == pytest.approx(0.5, rel=1e-3)
+    assert found.covariance[1].diagonal() == pytest.approx(0.5 * fix**2, rel=1e-6)
 
 
 def test_a_certified_mirror_image_is_not_unique():

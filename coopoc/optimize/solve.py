@@ -136,8 +136,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     result = backend.run(problem, start, options)
     if constraints:
         far = has_start and abs(problem.cost(given) - problem.cost(result.x)) > RIVAL_COST
-        bent = not all(c.measurement.linear for c in constraints)
-        if (bent and _violated(problem, result.x)) or (not whole and (far or searching)):
+        if not problem.linear and (_violated(problem, result.x) or (not whole and (far or searching))):
             problem, result = _drawn(problem, backend, options, result, has_start)
     elif has_start and not problem.linear:
         problem, result = _challenged(problem, backend, options, result, whole)

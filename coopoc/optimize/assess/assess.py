@@ -143,6 +143,8 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return unknown._replace(unobservable=nodes)
+    if entries.size <= DENSE_COLUMNS:
+        cov = _by_rows(problem, x, cov)
     if bent is None:
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):
@@ -171,6 +173,25 @@ def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]
         blocks = system.cholesky.inverse(rows, columns)
     cov[free] = blocks
     return cov, blocks[rows == columns]
+
+
+def _by_rows(problem: Problem, x: Floats, cov: Floats) -> Floats:
+    """Marginals (n, dof, dof) by R of J = Q R, rows of large numbers first and columns pivoted, which keeps digits that
+    J^T J rounds away; `cov` where J is singular.
+
+    References:
+        Cox, Higham, Stability of Householder QR factorization for weighted least squares problems, 1998.
+    """
+    from scipy.linalg import inv, qr
+
+    J = as_stated(problem).whiten(x)[1].toarray()[:, problem.movable.ravel()]
+    upper, pivot = qr(J[np.argsort(-abs(J).max(1))], mode="r", pivoting=True)
+    own = abs(upper.diagonal())
+    if len(own) == J.shape[1] and own.min() > ROUNDED * own.max():
+        free, rows, columns = sparse(problem).entries.marginals
+        half = inv(upper[: len(own)])[np.argsort(pivot)]
+        cov[free] = np.vecdot(half[rows], half[columns])
+    return cov
 
 
 def _symmetric(entries: Entries, values: Floats) -> Any:
