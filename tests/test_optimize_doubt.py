@@ -73,6 +73,9 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
     out, err = capsys.readouterr()
     assert "line 5: information was not positive definite" in err
     assert json.loads(out)["notes"] != []
+    file.write_text(file.read_text().replace("4 0 0 4 0 9", "0 0 0 0 0 0"))
+    with refused("leave the measurement out.$"):
+        load_graph(file, repair=True)
 
 
 @pytest.mark.parametrize("seed", [7, 13, 20])

@@ -179,8 +179,9 @@ def inverse(matrices: Floats, location: Callable[[int], str], repairs: list[str]
                 location(row),
                 f"information {matrices[row][np.triu_indices(len(own))].tolist()}",
                 "must be positive definite: a singular one has no inverse",
-                "Give every component some information, leave the measurement out, or read the file with repair=True "
-                "(coopoc solve --repair), which takes the nearest that is.",
+                "Give every component some information or leave the measurement out."
+                + " Or read with repair=True (coopoc solve --repair), which takes the nearest that is."
+                * bool(own[-1] > 0),
             )
         scaled[row] = axes * np.maximum(own, REPAIRED * own[-1]) @ axes.T
         repairs.append(
