@@ -49,7 +49,7 @@ USUAL_HEADERS = {
 PLAIN = "must be a finite number as -1234.5, without a unit, separators of thousands or N, S, E, W"
 SECONDS = "must be seconds, or a date as 2024-05-01T12:00:00Z, to which pandas.to_datetime converts others"
 """What a number, and a time, is in a cell."""
-OTHER_MEANINGS = {"rate", "vertical", "acc", "accel", "accuracy", "std", "sigma", "error", "variance", "cov"}
+OTHER_MEANINGS = "rate vertical acc accel accuracy std sigma error variance cov"
 """Words beside which these mean something else."""
 
 
@@ -264,7 +264,7 @@ def usual_key(header: str) -> str:
     """
     parts = {header.lower(), *(word.lower() for word in re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header))}
     usual = (key for key, words in USUAL_HEADERS.items() if not parts.isdisjoint(words.split()))
-    return next(usual, "") if parts.isdisjoint(OTHER_MEANINGS) else ""
+    return next(usual, "") if parts.isdisjoint(OTHER_MEANINGS.split()) else ""
 
 
 def missing_column(file: str, column: str, frame: DataFrame, allowed: str, key: str = "", more: str = "") -> InputError:

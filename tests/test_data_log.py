@@ -120,7 +120,11 @@ def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhe
     assert log.recording.sensors.gnss_std[:2] == pytest.approx((2.5, 2.5))
     assert any("std of fixes.csv is the standard deviation of each of x, y" in one for one in log.summary.assumed)
     write(fixes.assign(t=t + 0.1), tmp_path / "log" / "gps.csv")
-    assert "fixes of car (fixes.csv, gps.csv) come" in f"{read_log(tmp_path / 'log').summary}"
+    write(motion.assign(t=t + 0.1), tmp_path / "log" / "wheel.csv")
+    assert (
+        "one kind of car (motion.csv, wheel.csv), car (fixes.csv, gps.csv) come"
+        in f"{read_log(tmp_path / 'log').summary}"
+    )
     mixed = read_log(write(fixes.assign(vx=5.0, vy=0.0, value=1.0), tmp_path / "mixed.csv"))
     assert mixed.recording.sensors.gnss_std[:2] == pytest.approx(co.Sensors().gnss_std[:2])
     unused = " ".join(map(str, mixed.summary.unused))

@@ -78,8 +78,11 @@ READERS: Mapping[str, Callable[..., Rows]] = {
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore, stamps, ...) -> its rows. A new format is one more
 entry."""
-SEVERAL = "fixes of {} come from files side by side: of several antennas, or one is the truth, which truth= names"
-"""What is assumed of two files with fixes of one vehicle."""
+SEVERAL = (
+    "measurements of one kind of {} come side by side: of several sensors (ignore= leaves out topics of a bag), or one "
+    "is the truth, which truth= names"
+)
+"""What is assumed of two files, or topics, with what one vehicle measures of itself."""
 SPARSE_SECONDS = 0.5
 """s between samples of a truth from which straight lines between them are not the path; within so many s of a sample
 the curve through all counts as truth."""
@@ -246,8 +249,9 @@ def read_log(
     summary.logged = rows.groupby("vehicle")["kind"].unique().to_dict()
     rows, true_rows = not_vague(rows[measured], summary), rows[~measured]
     rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
-    spans = only(rows, "x").groupby(["vehicle", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
-    for name, span in spans.groupby("vehicle"):
+    own = rows[in_group(rows, "fix", "odometry", "heading")]
+    spans = own.groupby(["vehicle", "kind", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
+    for (name, _), span in spans.groupby(["vehicle", "kind"]):
         if (span["min"] < span["max"].cummax().shift()).any():
             summary.assume(SEVERAL, f"{name} ({', '.join(sorted(span['file']))})")
     deviations = factors(std, sorted({*kind, *rows["kind"]} - {"message"}), "std")
