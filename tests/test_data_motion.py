@@ -204,6 +204,19 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, st
         assert error(by_fixes, method) < 1.3 * alone
 
 
+@pytest.mark.parametrize("kind", ["speed", "heading"])
+def test_a_signal_that_is_late_is_named(tmp_path, kind):
+    """And no antenna."""
+    signals = {"speed": 8 + 4 * sin(0.7 * T), "heading": 2.5 * sin(0.13 * T)}
+    way = cumsum(0.1 * signals["speed"] * np.exp(1j * signals["heading"]))
+    fixes = where(arange(len(T)) % 10, nan, way + default_rng(0).normal(0, 0.7, (len(T), 2)) @ [1, 1j])
+    signals[kind] = np.interp(T - 0.5, T, signals[kind])
+    pd.DataFrame({"t": T, "vehicle": "a", "x": fixes.real, "y": fixes.imag, **signals}).to_csv(tmp_path / "a.csv")
+    sentences = " ".join(check(co.read_log(tmp_path)).warnings)
+    assert f"a: its {kind}s are 0." in sentences
+    assert "antenna" not in sentences
+
+
 def test_a_heading_that_drifts_is_followed(tmp_path):
     """By 2 degrees a minute, beside fixes alone: 13 m off where its error hardly changes."""
     compass = COURSE + np.radians(2) * T / 60 + default_rng(0).normal(0, 0.01, len(T))

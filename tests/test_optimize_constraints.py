@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused, same_minimum
+from numpy import arange, array, cos, diff, stack, zeros
 from numpy.linalg import inv, norm
 from numpy.random import default_rng
 from random_graphs import AB, PAIR
@@ -86,7 +87,7 @@ def chain(points, seed):
     truth = np.cumsum(rng.normal(size=(points, 3)), axis=0)
     names = tuple(f"p{k}" for k in range(points))
     problem = Problem(names).add("position", names, truth + rng.normal(0, 3, truth.shape), std=3.0)
-    return problem.add("displacement", list(pairwise(names)), np.diff(truth, axis=0), std=0.003)
+    return problem.add("displacement", list(pairwise(names)), diff(truth, axis=0), std=0.003)
 
 
 @pytest.mark.parametrize("backend", BOTH)
@@ -121,14 +122,14 @@ def test_constraints_that_do_not_push_change_nothing(dense, length, backend):
 def drive(seed, vehicles=2, steps=4):
     """Vehicles on the road, with fixes, odometry that runs ahead and ranging to the one in front."""
     rng = default_rng(seed)
-    t = 0.5 * np.arange(steps)[:, None]
-    x, y = 14.0 * t - 20.0 * np.arange(vehicles), 0.0 * t + np.zeros(vehicles)
-    truth = np.stack([x, y, road(x, y)], -1)
+    t = 0.5 * arange(steps)[:, None]
+    x, y = 14.0 * t - 20.0 * arange(vehicles), 0.0 * t + zeros(vehicles)
+    truth = stack([x, y, road(x, y)], -1)
     names = [[f"v{v}@{s}" for v in range(vehicles)] for s in range(steps)]
     flat = tuple(n for row in names for n in row)
     moved = [(a, b) for now, then in pairwise(names) for a, b in zip(now, then, strict=True)]
     problem = Problem(flat).add("position", flat, truth.reshape(-1, 3) + rng.normal(0, 2, (len(flat), 3)), std=2.0)
-    gone = np.diff(truth, axis=0).reshape(-1, 3)
+    gone = diff(truth, axis=0).reshape(-1, 3)
     problem = problem.add("displacement", moved, 1.1 * gone + rng.normal(0, 0.3, (len(moved), 3)), std=0.3)
     ahead = [(b, a) for row in names for a, b in pairwise(row)]
     gap = (truth[:, :-1] - truth[:, 1:]).reshape(-1, 3)
@@ -143,7 +144,7 @@ def scipys(problem):
     """SciPy on the same problem: its cost and gradient are ours, the constraints and their derivatives written here."""
     n = len(problem.names)
     moved = next(f.nodes for f in problem.factors if f.kind == "displacement")
-    ties = np.zeros((3 * len(moved), 3 * n))
+    ties = zeros((3 * len(moved), 3 * n))
     for k, (i, j) in enumerate(moved):
         for c in range(3):
             ties[3 * k + c, [3 * i + c, 3 * j + c]] = -1.0, 1.0
@@ -153,10 +154,10 @@ def scipys(problem):
         return z - road(x, y)
 
     def rise_slope(flat):
-        jacobian = np.zeros((n, 3 * n))
-        k = np.arange(n)
+        jacobian = zeros((n, 3 * n))
+        k = arange(n)
         jacobian[k, 3 * k], jacobian[k, 3 * k + 1], jacobian[k, 3 * k + 2] = (
-            -2.0 / 15.0 * np.cos(flat[::3] / 15.0),
+            -2.0 / 15.0 * cos(flat[::3] / 15.0),
             -0.05,
             1.0,
         )
@@ -205,12 +206,12 @@ def test_the_covariance_holds_equalities_exactly():
     problem = drive(1)
     solution = solve(problem, "casadi")
     _, J = problem.whiten(solution.x)
-    rows = np.zeros((len(solution.x), J.shape[1]))
+    rows = zeros((len(solution.x), J.shape[1]))
     for k, (x, _, _) in enumerate(solution.x):
-        rows[k, 3 * k : 3 * k + 3] = -2.0 / 15.0 * np.cos(x / 15.0), -0.05, 1.0
+        rows[k, 3 * k : 3 * k + 3] = -2.0 / 15.0 * cos(x / 15.0), -0.05, 1.0
     Z = null_space(rows)
     cov = Z @ inv(Z.T @ (J.T @ J).toarray() @ Z) @ Z.T
-    own = np.stack([cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(solution.x))])
+    own = stack([cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(solution.x))])
     assert solution.covariance == pytest.approx(own, abs=1e-9)
 
 
@@ -238,12 +239,12 @@ def test_multipliers_are_those_of_ipopt():
 def test_poses_in_a_slab():
     """osqp holds bounds on positions of poses; casadi agrees, and a step of SciPy's BVLS around it moves nothing."""
     rng, n = default_rng(0), 6
-    at = np.c_[5.0 * np.arange(n), rng.normal(0, 1, n)]
+    at = np.c_[5.0 * arange(n), rng.normal(0, 1, n)]
     turn = rng.normal(0, 0.3, n)
-    c, s = np.cos(turn[:-1]), np.sin(turn[:-1])
-    gap = np.diff(at, axis=0)
+    c, s = cos(turn[:-1]), np.sin(turn[:-1])
+    gap = diff(at, axis=0)
     seen = np.c_[c * gap[:, 0] + s * gap[:, 1], c * gap[:, 1] - s * gap[:, 0]]
-    z = pose(seen + rng.normal(0, 0.1, seen.shape), np.diff(turn) + rng.normal(0, 0.05, n - 1))
+    z = pose(seen + rng.normal(0, 0.1, seen.shape), diff(turn) + rng.normal(0, 0.05, n - 1))
     names = tuple("abcdef")
     problem = Problem(names, dimension=2, poses=range(n), x0=pose(at + 0.2, turn + 0.1))
     problem = problem.add("pose", "a", pose(at[0], turn[0]), 0.1).add("relative_pose", list(pairwise(names)), z, 0.1)
@@ -281,7 +282,7 @@ EMPTY = {
 @pytest.mark.parametrize("backend", ["casadi", "osqp"])
 def test_what_equalities_place_is_known_exactly(backend):
     """Also where one more says the same, but for casadi, which takes no more equalities than numbers that can move."""
-    places = np.array([[1.0, 0, 0], [6, 0, 0]])
+    places = array([[1.0, 0, 0], [6, 0, 0]])
     placed = PAIR.constrain("position", ["a", "b"], places, places)
     more = placed.constrain("displacement", AB, [5, 0, 0], [5, 0, 0])
     for problem in (placed, more):
@@ -312,7 +313,7 @@ def test_an_empty_set_is_infeasible_and_names_the_worst(case):
 def test_bounds_of_an_angle_turn_with_the_problem():
     costs = []
     for turn in (0.0, np.pi, -np.pi, 3 * np.pi):
-        problem = Problem(AB, dimension=2).add("position", AB, [[0, 0], [5 * np.cos(turn), 0]], std=1.0)
+        problem = Problem(AB, dimension=2).add("position", AB, [[0, 0], [5 * cos(turn), 0]], std=1.0)
         costs.append(solve(problem.constrain("azimuth", AB, turn + 0.1, turn + 0.2)).cost)
     assert costs == pytest.approx([costs[0]] * 4)
 
@@ -348,8 +349,8 @@ def test_osqp_holds_answers_against_all_kkt_conditions():
 
     def holds(q, x, y):
         one = eye(1, format="csc")
-        sides = np.array([[-1.0], [1.0]])
-        return Programme(one, one)._holds(np.ones(1), np.array([q]), *sides, np.array([x]), np.array([y]))
+        sides = array([[-1.0], [1.0]])
+        return Programme(one, one)._holds(np.ones(1), array([q]), *sides, array([x]), array([y]))
 
     assert holds(-2.0, 1.0, 1.0)  # pushed by the upper bound
     assert holds(2.0, -1.0, -1.0)
@@ -371,7 +372,7 @@ def test_osqp_holds_answers_against_all_kkt_conditions():
 def test_a_claim_is_verified_independently_of_the_solver_and_followed_by_another(monkeypatch, claim, status):
     claims = Backend(
         "claims",
-        lambda problem, x: SolverResult(np.array(claim, float), 1),
+        lambda problem, x: SolverResult(array(claim, float), 1),
         capabilities=Capabilities(constraints="linear"),
     )
     problem = PAIR.constrain("position", "a", upper=[5, INF, INF])
@@ -384,8 +385,8 @@ def test_a_claim_is_verified_independently_of_the_solver_and_followed_by_another
 def test_vehicles_between_kerbs_end_as_low_as_from_the_truth(loss):
     """Fixes of 15 m, ranges of 0.3 m, many minima; without an x0, and from one that is far off."""
     rng = default_rng(0)
-    truth = np.stack([rng.uniform(-30, 30, 6), rng.uniform(-4, 4, 6)], axis=1)
-    pairs = rng.permutation(np.stack(np.triu_indices(6, 1), 1))[:10]
+    truth = stack([rng.uniform(-30, 30, 6), rng.uniform(-4, 4, 6)], axis=1)
+    pairs = rng.permutation(stack(np.triu_indices(6, 1), 1))[:10]
     ranges = norm(truth[pairs[:, 0]] - truth[pairs[:, 1]], axis=1) + rng.normal(0, 0.3, 10)
     problem = Problem(tuple("abcdef"), dimension=2).add("range", pairs, ranges, std=0.3, loss=loss)
     problem = problem.add("position", range(6), truth + rng.normal(0, 15, (6, 2)), std=15.0)

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import refused
-from numpy import inf, nan
+from numpy import eye, inf, nan, ones, zeros
 from numpy.linalg import cholesky, eigvalsh, inv, lstsq
 from numpy.random import default_rng
 from oracles.whitened import whitened
@@ -106,12 +106,12 @@ BAD = {
     "no std": (lambda: PAIR.add("range", AB, 5.0), "exactly one of std, cov"),
     "shape of z": (lambda: PAIR.add("spherical", AB, [5.0], std=1.0), "must have 2 or 3"),
     "shape of std": (lambda: PAIR.add("spherical", AB, [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
-    "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.ones((2, 3))), "square matrices"),
+    "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=ones((2, 3))), "square matrices"),
     "std of a turn": (lambda: PAIR.add("azimuth", AB, 0.1, std=4.0), "<= pi rad"),
-    "another shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.eye(2)), "cov of position"),
+    "another shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=eye(2)), "cov of position"),
     "variance in degrees": (lambda: PAIR.add("azimuth", AB, 1.0, cov=[[16.0]]), "<= pi rad"),
     "bound in degrees": (lambda: PAIR.constrain("azimuth", AB, 45.0), "deg2rad"),
-    "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
+    "shape of a root": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=eye(2)), r"\(1, 1\)"),
     "root not finite": (lambda: PAIR.add("azimuth", AB, 0.1, sqrt_information=[[inf]]), "must be finite"),
     "heights in a plane": (
         lambda: Problem([*"ab"], dimension=2).constrain("inclination", AB, 0.0, 1.0),
@@ -129,11 +129,11 @@ BAD = {
         "is not quadratic",
     ),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
-    "columns of nodes": (lambda: PAIR.add("displacement", np.ones((2, 4), int), np.ones(3), std=1.0), "must name 2"),
+    "columns of nodes": (lambda: PAIR.add("displacement", ones((2, 4), int), ones(3), std=1.0), "must name 2"),
     "a mask": (lambda: Problem([*"ab"], fixed=[True, False]), "node = True"),
     "whole numbers for names": (lambda: Problem((2, 1)), r"names = .2, 1.: must be a sequence of texts"),
     "twice a name": (lambda: Problem([*"baa"]), r"\['a'\]: must be unique"),
-    "x0": (lambda: Problem(AB, x0=np.zeros((3, 3))), "shape"),
+    "x0": (lambda: Problem(AB, x0=zeros((3, 3))), "shape"),
     "no factors": (lambda: solve(Problem([*"a"])), "no measurements"),
     "words for z": (lambda: PAIR.add("range", AB, "far", std=1.0), "array of numbers"),
     "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
@@ -143,11 +143,11 @@ BAD = {
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
     "coincident, bounded": (
-        lambda: solve(replace(PAIR, x0=np.zeros((2, 3))).constrain("range", AB, 4.0, 5.0)),
+        lambda: solve(replace(PAIR, x0=zeros((2, 3))).constrain("range", AB, 4.0, 5.0)),
         "a and b coincide",
     ),
     "nothing to relax": (lambda: quadratic(Problem([*"a"])), "no measurements"),
-    "two runs": (lambda: Problem([*"a"]).add("position", "a", np.zeros((2, 1, 3)), std=1.0), "a problem for each run"),
+    "two runs": (lambda: Problem([*"a"]).add("position", "a", zeros((2, 1, 3)), std=1.0), "a problem for each run"),
 }
 
 
@@ -194,13 +194,13 @@ def test_a_start_is_the_least_squares_of_the_converted_vectors(recording):
     for factor, z, cov in (
         (fixes, fixes.z, np.diag(np.square(fixes.std[0]))),
         (edges, to_vector(edges.z), vector_cov(edges.z, S2.relative_std)),
-        (problem.factors[-1], problem.factors[-1].z, np.eye(3)),
+        (problem.factors[-1], problem.factors[-1].z, eye(3)),
     ):
         for nodes, value, own in zip(factor.nodes, z, np.broadcast_to(cov, (len(z), 3, 3)), strict=True):
-            wide = np.zeros((3, len(star.names), 3))
-            wide[:, nodes[-1]] = np.eye(3)
+            wide = zeros((3, len(star.names), 3))
+            wide[:, nodes[-1]] = eye(3)
             if len(nodes) == 2:
-                wide[:, nodes[0]] = -np.eye(3)
+                wide[:, nodes[0]] = -eye(3)
             root = cholesky(inv(own)).T
             rows.append(root @ wide.reshape(3, -1))
             goals.append(root @ value)
@@ -263,7 +263,7 @@ def test_what_is_missing_is_no_factor(incomplete, noise):
                 if noise is not None and np.isfinite(z).all():
                     hand = hand.add("displacement", pair, to_vector(z), std=1.0)
                     continue
-                stds = np.ones(3) if noise is not None else np.broadcast_to(relative_std(z[None], sensors), (1, 3))[0]
+                stds = ones(3) if noise is not None else np.broadcast_to(relative_std(z[None], sensors), (1, 3))[0]
                 for kind, value, std in zip(("range", "azimuth", "inclination"), z, stds, strict=True):
                     if np.isfinite(value):
                         hand = hand.add(kind, pair, value, std=std)
@@ -277,6 +277,6 @@ def test_what_is_missing_is_no_factor(incomplete, noise):
 
 @pytest.mark.parametrize("poses", [(), (1,), (0, 2)])
 def test_a_point_among_poses_has_no_rotation_to_move(poses):
-    problem = Problem([*"abc"], x0=pose(np.zeros((3, 2))) if poses else np.zeros((3, 2)), dimension=2, poses=poses)
+    problem = Problem([*"abc"], x0=pose(zeros((3, 2))) if poses else zeros((3, 2)), dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)
     assert problem.movable.sum(1).tolist() == wanted.tolist()

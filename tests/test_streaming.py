@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import holed, measured, refused, textbook
-from numpy import nan
+from numpy import array, diag, nan, sqrt, square, zeros
 from numpy.linalg import eigvalsh, inv, lstsq
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -37,7 +37,7 @@ STARTS: dict[str, Callable[..., Any]] = {
     **{name: start for name, (_, start) in SOLO.items()},
     "star": partial(StarStream, CooperativeFilter(FITTED, AS_STATED)),
 }
-U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
+U, Z = array([9.0, -2.0, 0.1]), array([30.0, 20.0, 1.0])
 
 
 def play(stream, recording, ego, run, first=0):
@@ -78,15 +78,15 @@ def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start, near
     star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
     draw, stream = default_rng(0), start(interval=0.1)
     stream.step(Z, U, 0.1)
-    theirs, t, path = filterpys(Z, np.diag(FITTED.gnss_variance), 0.1), [0.0, 0.1], [0 * U, 0.1 * U]
+    theirs, t, path = filterpys(Z, diag(FITTED.gnss_variance), 0.1), [0.0, 0.1], [0 * U, 0.1 * U]
     for k in range(200):
         dt, u, z = draw.uniform(0.02, 0.5), draw.normal(0, 9, 3), Z + draw.normal(0, 3, 3)
         t, path = [*t, t[-1] + dt], [*path, path[-1] + dt * u]
-        theirs.predict(u=u, B=dt * np.eye(3), Q=dt / 0.1 * np.diag(np.square(FITTED.process_std)))
+        theirs.predict(u=u, B=dt * np.eye(3), Q=dt / 0.1 * diag(square(FITTED.process_std)))
         there, age = draw.uniform() > 0.3, draw.uniform(0, 0.6) * (k > 30)
         if there:
-            moved = path[-1] - [np.interp(t[-1] - age, t, column) for column in np.array(path).T]
-            theirs.update(z + moved, R=np.diag(FITTED.gnss_variance + age / 0.1 * np.square(FITTED.process_std)))
+            moved = path[-1] - [np.interp(t[-1] - age, t, column) for column in array(path).T]
+            theirs.update(z + moved, R=diag(FITTED.gnss_variance + age / 0.1 * square(FITTED.process_std)))
         x, cov = stream.step(z if there else None, u, dt, fix_age=age)
         assert_allclose(x, theirs.x, atol=near)
         assert_allclose(cov, theirs.P, atol=near)
@@ -118,8 +118,8 @@ def test_nothing_is_known_before_the_first_fix(name):
     x, cov = stream.step(Z, U, 0.1, fix_age=0.3)
     assert_allclose(x, Z + 0.3 * U, atol=1e-5)
     if name == "nominal":
-        variance = np.square(S2.gnss_std) + 3 * S2.motion_std(U[None, None, None], 0.1)[0, 0, 0] ** 2
-        assert_allclose(np.diag(cov), variance)
+        variance = square(S2.gnss_std) + 3 * S2.motion_std(U[None, None, None], 0.1)[0, 0, 0] ** 2
+        assert_allclose(diag(cov), variance)
 
 
 def window(draw, steps, late, q, r):
@@ -138,16 +138,16 @@ def window(draw, steps, late, q, r):
         x, _ = full.step([fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1, fix_age=0.1 * (t - at[t]))
         without, _ = prompt.step(None if stale else [fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1)
     rows = np.vstack([np.eye(steps + 1)[at] / r, np.diff(np.eye(steps + 1), axis=0) / q])
-    best = lstsq(rows, np.concatenate([fixes / r, np.zeros(steps)]), rcond=None)[0][-1]
-    return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], np.sqrt(inv(rows.T @ rows)[-1, -1])
+    best = lstsq(rows, np.concatenate([fixes / r, zeros(steps)]), rcond=None)[0][-1]
+    return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], sqrt(inv(rows.T @ rows)[-1, -1])
 
 
 def test_a_late_fix_is_nearly_used_up():
     """0.3 s late at the noise of scenario 2 at 10 m/s: within 2 % of the least squares over the whole window, which
     is itself as good as it says; without the late fixes a filter is clearly worse."""
     draw = default_rng(5)
-    errors = np.array([window(draw, 60, 3, q=0.1, r=3.5) for _ in range(150)])
-    ours, best, without, _ = np.sqrt(np.mean(errors**2, 0))
+    errors = array([window(draw, 60, 3, q=0.1, r=3.5) for _ in range(150)])
+    ours, best, without, _ = sqrt(np.mean(errors**2, 0))
     assert best == pytest.approx(errors[0, 3], rel=0.2)
     assert ours < 1.02 * best
     assert without > 1.1 * best
@@ -180,7 +180,7 @@ def test_the_motion_that_is_kept_is_its_integral():
     rng, history = default_rng(0), MotionHistory(10.0)
     dt = np.concatenate([rng.uniform(0.2, 0.9, 100), rng.uniform(0.01, 0.05, 500), rng.uniform(0.2, 0.9, 50)])
     moved, variance = rng.normal(size=(len(dt), 3)), rng.uniform(size=(len(dt), 3))
-    end, sums = np.append(0.0, np.cumsum(dt)), np.zeros((len(dt) + 1, 6))
+    end, sums = np.append(0.0, np.cumsum(dt)), zeros((len(dt) + 1, 6))
     sums[1:] = np.cumsum(np.hstack([moved, variance]), 0)
     for k, step in enumerate(dt, start=1):
         history.push(step, moved[k - 1], variance[k - 1])
@@ -206,7 +206,7 @@ def test_bad_starts_are_named():
         with refused(f"^{field} = "):
             make()
     assert StarStream(CooperativeFilter(FITTED)).broadcast is None
-    oracle = Kalman(NoiseModel.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
+    oracle = Kalman(NoiseModel.oracle(S2, Fleet(("a",), [0, 0.1], zeros((2, 1, 3)), zeros((2, 1, 3)))))
     with refused(r"noise_model = 'oracle'.*NoiseModel.nominal"):
         oracle.start()
 
@@ -239,7 +239,7 @@ def test_a_star_follows_again_after_a_pause_of_one_step():
     for k, error in enumerate(noise):
         if k == 30:
             stream.step(None, [0, 0, 0], 60.0)
-        place = 10.0 * k * np.array([1, 0, 0]) + [0, 5000 * (k >= 30), 0]
+        place = 10.0 * k * array([1, 0, 0]) + [0, 5000 * (k >= 30), 0]
         x, _ = stream.step(place + error, [10, 0, 0], 1.0)
     assert abs(x - place).max() < 10.0
 
@@ -250,12 +250,12 @@ def test_velocities_of_short_and_long_steps_are_alike_plausible():
     for k in range(600):
         dt = 0.199 if k % 2 else 0.001
         noise, place = (
-            0.1 * abs(U) * np.sqrt(0.1 / dt) * draw.normal(size=3),
+            0.1 * abs(U) * sqrt(0.1 / dt) * draw.normal(size=3),
             U * (0.1 * (k - k % 2) + 0.001 + 0.199 * (k % 2)),
         )
         x, _ = stream.step(place + draw.normal(0, 1.5, 3) if k % 10 == 0 else None, U + noise, dt)
         errors.append(x - place)
-    assert np.sqrt(np.square(errors[100:]).sum(axis=1).mean()) < 2.0
+    assert sqrt(square(errors[100:]).sum(axis=1).mean()) < 2.0
 
 
 @pytest.mark.slow
@@ -268,9 +268,9 @@ def test_the_replay_runs(log):
     out = ran(command, check=True).stdout
     assert ("No log given" in out) == (log == "bundled")
     rows = [line.split("  ") for line in out.splitlines() if line.startswith(("Kal", "OKF", "Fed"))]
-    numbers = np.array([[float(word) for word in row[1:] if word.strip()] for row in rows])
+    numbers = array([[float(word) for word in row[1:] if word.strip()] for row in rows])
     assert numbers.shape == (4, 6)
-    assert (numbers[:, :5] < 2.5 * np.sqrt(3)).all(), "better than the fixes, however bad the log is"
+    assert (numbers[:, :5] < 2.5 * sqrt(3)).all(), "better than the fixes, however bad the log is"
     assert (numbers[:, 5] > 50).all(), "steps per second"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused, winding, without
-from numpy import pi
+from numpy import arange, array, diag, eye, pi
 from numpy.linalg import norm, solve
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -66,7 +66,7 @@ def links(recording):
 
 def damaged(recording, kind, links):
     """One wrong number in each run, of 1 to 1e6 m in a random direction; of an angle anything."""
-    rng, run = default_rng(1), np.arange(RUNS)
+    rng, run = default_rng(1), arange(RUNS)
     size, way = SIZES, rng.normal(size=(RUNS, 3))
     gnss, relative = recording.gnss.copy(), recording.relative.copy()
     step, sender = recording.links.step[links], recording.links.neighbour[links]
@@ -95,7 +95,7 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(name, 
     for kind in KINDS:
         moved = norm(method(damaged(recording, kind, links).of_runs(runs), [EGO]).x[:, :, 0] - clean, axis=-1)
         farthest = max(farthest, float(moved.max()))
-        later: Floats = np.array([row[t + 10 :].max() for row, t in zip(moved, step, strict=True)])
+        later: Floats = array([row[t + 10 :].max() for row, t in zip(moved, step, strict=True)])
         beyond = after if name in FURTHER else BEYOND
         assert not robust or (later.max() < after and later[SIZES[runs] > FAR].max() < beyond), (kind, later)
     assert (farthest < once) == robust
@@ -104,7 +104,7 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(name, 
 def estimates(recording, kind, links):
     """Position (R, T, 3) m of the cooperative filter and its std (R, T) m, a wrong number in each run. "position",
     "odometer" and "velocity" are those of a message."""
-    method, run, of = CooperativeFilter(), np.arange(RUNS), recording.links
+    method, run, of = CooperativeFilter(), arange(RUNS), recording.links
     step, sender = of.step[links], of.neighbour[links]
     way = default_rng(1).normal(size=(RUNS, 3))
     error = SIZES[:, None] * way / norm(way, axis=1, keepdims=True)
@@ -135,7 +135,7 @@ def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_d
     (x, _), (clean, std) = estimates(recording, kind, links), estimates(recording, "", links)
     moved, step = norm(x - clean, axis=-1), recording.links.step[links]
     scaled = moved / (1.0 if first else std)
-    later: Floats = np.array([row[t + 10 :].max() for row, t in zip(scaled, step, strict=True)])
+    later: Floats = array([row[t + 10 :].max() for row, t in zip(scaled, step, strict=True)])
     most = {"fix": 8.0}.get(kind, 2.0), 1.2
     if first:
         most = (0.3, 0.3) if kind == "velocity" else (0.25, 0.16)
@@ -152,7 +152,7 @@ def wild_fixes(steps):
     wild = rng.random(steps) < 0.15
     wild[:5] = False
     gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
-    peer = filterpys(gnss[0, 0, 0], 12.25 * np.eye(3), 0.1)
+    peer = filterpys(gnss[0, 0, 0], 12.25 * eye(3), 0.1)
     return replace(drive, gnss=gnss), S2.motion_std(drive.velocity, 0.1)[0, :, 0] ** 2, peer
 
 
@@ -163,13 +163,13 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation():
     (drive, process, peer), method = wild_fixes(200), CooperativeFilter(priors=alone)
     track, limit, hits = method(drive, [0]), method.priors.fix_gate, 0.0
     for t in range(1, 200):
-        peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
-        innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
+        peer.predict(u=drive.velocity[0, t, 0], Q=diag(process[t]))
+        innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * eye(3)
         q = innovation @ solve(S, innovation)
         gain, share = 1 - 3 * 12.25 / np.trace(S), max(q / limit, 1.0) if hits < gate.PATIENCE else 1.0
         hits = hits + gain if q > limit else max(hits - gate.LEAK * gain, 0.0)
         if share < gate.HARD_REJECT_FACTOR:
-            peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
+            peer.update(drive.gnss[0, t, 0], R=12.25 * eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 
 
@@ -184,8 +184,8 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances():
     copy, evidence, since, returns = None, 0.0, 0.0, list[int]()
     for t in range(1, 300):
         z, moved = gnss[0, t, 0], drive.velocity[0, t, 0]
-        peer.predict(u=moved, Q=np.diag(process[t]))
-        gap, variance = z - peer.x, np.diag(peer.P)
+        peer.predict(u=moved, Q=diag(process[t]))
+        gap, variance = z - peer.x, diag(peer.P)
         q = float((gap**2 / (variance + r + gate.SLIP_M2)).sum())
         gain = float((variance / (variance + r)).mean())
         since = 0.0 if q > gate.FIX_GATE else since + gain
@@ -196,7 +196,7 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances():
             more = min(q, gate.HARD_REJECT_FACTOR * gate.FIX_GATE) - other
             evidence = max(evidence + more, 0.0) if other <= gate.FIX_GATE else 0.0
             if evidence > gate.FIXES_TO_RETURN * gate.HARD_REJECT_FACTOR * gate.FIX_GATE and not vague:
-                peer.x, peer.P, copy, q, hits = x, np.diag(p), None, other, 0.0
+                peer.x, peer.P, copy, q, hits = x, diag(p), None, other, 0.0
                 returns.append(t)
             elif q <= gate.FIX_GATE and vague and since > gate.AWAY:
                 copy = None
@@ -218,9 +218,9 @@ S = co.Sensors(min_range=0.0)
 
 def drive(gap=(9.0, 0.0, 0.0), steps=80):
     """Two vehicles on a bend, the second `gap` m from the first."""
-    t = 0.1 * np.arange(steps)
+    t = 0.1 * arange(steps)
     velocity = np.c_[5 * np.cos(0.2 * t), 5 * np.sin(0.2 * t), 0 * t]
-    position = np.cumsum(0.1 * velocity, 0)[:, None] + np.arange(2)[:, None] * np.array(gap)
+    position = np.cumsum(0.1 * velocity, 0)[:, None] + arange(2)[:, None] * array(gap)
     return co.Fleet(("a", "b"), t, position, np.repeat(velocity[:, None], 2, axis=1))
 
 
@@ -263,8 +263,8 @@ class Changed(co.Kalman):
 
 def negative(track, share=0.0):
     """With another covariance from the fifth step on."""
-    covariance = np.array(track.covariance)
-    covariance[:, 5:] = np.eye(3) + share * np.eye(3, k=1) if share else -np.eye(3)
+    covariance = array(track.covariance)
+    covariance[:, 5:] = eye(3) + share * eye(3, k=1) if share else -eye(3)
     return replace(track, covariance=covariance)
 
 
@@ -280,9 +280,9 @@ def test_a_covariance_that_is_none_is_named_with_its_method_and_step(share):
 
 def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane():
     assert np.isfinite(co.nees(TRACK, without(FLEET, (slice(77, None), slice(None))))).sum() == 3 * 77
-    x, covariance = TRACK.x * [1, 1, 0], np.array(TRACK.covariance)
+    x, covariance = TRACK.x * [1, 1, 0], array(TRACK.covariance)
     covariance[..., 2, :] = covariance[..., :, 2] = 0
-    assert_allclose(*[co.nees(replace(TRACK, x=x, covariance=covariance + np.diag([0, 0, v])), FLEET) for v in (0, 1)])
+    assert_allclose(*[co.nees(replace(TRACK, x=x, covariance=covariance + diag([0, 0, v])), FLEET) for v in (0, 1)])
 
 
 @pytest.mark.parametrize(

@@ -427,7 +427,7 @@ def _with_fixes(c: Check, row: Row) -> str:
     column, mends = c.world.ids.index(name), f"clock={name}:{late:.3f}"
     used = np.isfinite(off[:, column])
     (ahead,), (unsure,) = factors(
-        off[used, column], made[2:, used, column].T, c.fix_noise * max(row["nis"] or 1.0, 1.0) ** 0.5
+        off[used, column], made[2:3, used, column].T, c.fix_noise * max(row["nis"] or 1.0, 1.0) ** 0.5
     )
     if abs(ahead + late) > SURE_ERRORS * np.hypot(unsure, row["late_s_error"]):
         return ", its fixes are not: is a velocity the mean of the interval before its stamp, which is half of it late?"
@@ -448,24 +448,37 @@ def _of_fixes(c: Check) -> Iterator[str]:
         row = next((row for row in c.vehicles if row["vehicle"] == name), {})
         finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
         shown = truth is None and c.shown(column)
-        for share in ([1, 1, 1], [0, 0, 1])[shown:]:  # without an arm that is sure a clock may explain it all
+        fits, left = [], list[float]()
+        for share in ([1, 1, 1, 0], [0, 0, 1, truth is None])[shown:]:  # what looks like an arm may be late signals
             x, z = (each[:, finite, column].T * share for each in (made, then))
-            factor, std = factors(off[finite, column], x, usual, np.zeros(len(x), int), z=z)
-            sure = abs(factor) > OFFSET_ERRORS * std
-            arm = (sure & (abs(factor) > LEAST_ARM))[:2].any() and abs(factor[:2]).max() < LONGEST_ARM
-            if arm:
-                yield (
-                    f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
-                    f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {what}: "
-                    f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
-                )
-                break
+            fits.append(factors(off[finite, column], x, usual, np.zeros(len(x), int), z=z))
+            rest = off[finite, column] - x @ fits[-1].value
+            left.append(float(norm(rest - rest.sum() / max(len(rest), 1))))
+        factor, std = fits[0]
+        arm = ((abs(factor) > OFFSET_ERRORS * std) & (abs(factor) > LEAST_ARM))[:2].any() and left[0] <= left[-1]
+        if arm and abs(factor[:2]).max() < LONGEST_ARM:
+            yield (
+                f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
+                f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {what}: "
+                f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
+            )
+        else:
+            arm, (factor, std) = False, fits[-1]
+        sure = abs(factor) > OFFSET_ERRORS * std
         wrong = _beyond(row, "nis", OUTLYING) or _beyond(row, "per_std", OUTLYING)
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= LONG_LAG:
             yield (
                 f"{name}: its fixes are {abs(lag):.0f} s {'behind' if lag > 0 else 'ahead of'} the {what}, which "
                 f"they else follow: clocks differ, as by leap seconds (clock={name}:{lag:.0f} where all its stamps "
                 "are so), or files of two drives."
+            )
+            continue
+        if sure[3] and left[-1] < left[0] and abs(factor[3]) >= BEHIND:
+            headings = abs(factor[2] + factor[3]) < abs(factor[2])
+            lag, kind = (factor[2], "headings") if headings else (factor[3], "speeds")
+            yield (
+                f"{name}: its {kind} are {abs(lag):.2f} s {'behind' if lag > 0 else 'ahead of'} its other signals: "
+                "a filter or a bus delays them. Correct their stamps."
             )
             continue
         if c.ahead[column] or _late(c, row) or _beyond(row, "fixes_late_s", BEHIND) or truth is None or arm:

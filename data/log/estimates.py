@@ -159,15 +159,17 @@ def lasting(parts: Floats) -> Floats:
 
 
 def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, and a clock that is 1 s
-    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes; and
-    instruments, by a later velocity: the filter errs by the noise of those until then."""
+    """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, a clock, and speeds alone
+    that are 1 s late make of it (4, T, N): against the truth, else against a filter, which is linear in what is added
+    to fixes; and instruments, by a later velocity: the filter errs by the noise of those until then. Headings that are
+    late are a clock without the speeds."""
     rec, truth = c.world, c.log.truth
     velocity = plane(rec.velocity[0] if truth is None else truth.velocity)
     speed = pd.DataFrame(abs(velocity)).where(lambda v: v > MOVING)
     course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
     ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > STEADY_SPEED_RATIO * speed.mean())
-    made = np.stack([ahead, 1j * ahead, velocity])
+    gained = np.diff(abs(np.nan_to_num(velocity)), axis=0, prepend=0.0) * np.nan_to_num(np.exp(1j * course))
+    made = np.stack([ahead, 1j * ahead, velocity, np.cumsum(gained, axis=0)])
     if truth is not None:
         return plane(rec.gnss[0] - truth.position), made, made
     then = np.nan_to_num(following(c, made, axis=1))
@@ -428,7 +430,7 @@ def against_truth(c: Check, late: Sequence[str]) -> Check:
     if truth is None:
         return c
     marks = np.isin(np.arange(len(rec.ids)), rec.landmarks) | (c.still & ~truth.present.any(0))
-    off, (_, _, velocity), _ = causes(c)
+    off, (_, _, velocity, _), _ = causes(c)
     fits = np.array([_beside(*one) < 3 * c.fix_noise for one in zip(off.T, velocity.T, strict=True)])
     x = np.where(marks[:, None], c.x, np.where((fits & ~np.isin(rec.ids, late))[:, None], truth.position, nan))
     residual, stated = residual_of(rec, x, c.log.summary.reversed_pairs)[1], np.array(noise.relative_std)
