@@ -64,10 +64,10 @@ Arms = Mapping[str, Sequence[float]] | Sequence[float]
 """m forward, left, up, of each vehicle by name, or of all."""
 LOST = 0.02
 """Largest share of the fixes that may fall on a step that already has one, and are lost."""
-SHORTEST_STEP, LONGEST_STEP, PAIR_COLUMNS = 0.02, 1.0, ("vehicle", "partner")
-"""s, of a step that is not given; what names a pair."""
+SHORTEST_STEP, LONGEST_STEP = 0.02, 1.0
+"""s, of a step that is not given."""
 FREQUENT_SHARE = 0.1
-"""Share of the measurements of the most frequent vehicle, or pair, from which one counts for the step."""
+"""Share of the measurements of the most frequent kind of a vehicle, or pair, from which one counts for the step."""
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
     **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
@@ -434,11 +434,11 @@ def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
 def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     """(T,) s, steps over all fixes and odometry."""
 
-    def densest(group: str, *keys: str) -> float:
-        times = rows[in_group(rows, group)].drop_duplicates([*keys, "t"]).sort_values("t").groupby(list(keys))["t"]
+    def densest(group: str) -> float:
+        times = rows[in_group(rows, group)].sort_values("t").groupby(["vehicle", "partner", "kind"])["t"]
         return float(times.agg(lambda t: t.diff().median())[times.size() >= FREQUENT_SHARE * times.size().max()].min())
 
-    moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR_COLUMNS)
+    moves, fixes, pairs = map(densest, ("odometry", "fix", "relative"))
     t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
     begin = float(t.min())
     span = t.max() - begin
@@ -449,7 +449,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
             "must hold two instants or more",
             "Is the file complete?",
         )
-    step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
+    step = dt or float(f"{max(moves if moves > 0 else fixes, SHORTEST_STEP):.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
     if dt is None:
