@@ -85,10 +85,10 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
     assert free.origin == pytest.approx((lat[0], lon[0], h[0]))
     assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
     assert read_log(tmp_path / "car7.csv", columns=names, ignore=["height"]).origin == (lat[0], lon[0], 0.0)
-    write(frame.assign(alt=frame["alt"][::3]), tmp_path / "car7.csv")
+    write(frame.assign(alt=frame["alt"][frame.index % 3 > 0]), tmp_path / "car7.csv")
     few = read_log(tmp_path / "car7.csv", columns=names, origin=origin)
     assert_allclose(few.recording.gnss[0, :, 0], fleet.position[:, 0], atol=1e-3)
-    assert few.summary.refused["heights of vehicles with few"][0] == 67
+    assert not few.summary.refused
     frame.loc[:9, ["lat", "lon", "alt"]] = 0.0
     write(frame, tmp_path / "car7.csv")
     late = read_log(tmp_path / "car7.csv", columns=names)

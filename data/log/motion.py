@@ -195,8 +195,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
             body frames no speed or yaw rate.
     """
     grid, summary, body = steps.grid, steps.summary, steps.body
-    flat = steps.planar or not rows["kind"].eq("z").any()
-    fixes = samples(rows, ("x", "y", "z"), summary, 2 if flat else 3)
+    fixes = samples(rows, ("x", "y", "z"), summary, 2)
     if not fixes.size and len(parts := only(rows, "x", "y")):
         raise InputError(
             f"{row_of(parts)}, fixes of {name}",
@@ -204,10 +203,10 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
             "must have equal stamps",
             "Give all numbers of a fix the same t, rounded if need be.",
         )
-    if flat:
+    if np.isnan(fixes.value).any():
         fixes.value[:, 2] = 0.0
-    if flat and not steps.planar:
-        summary.assume("heights of {} are 0: none were logged, or few", name)
+        if not steps.planar:
+            summary.assume("heights of {} are 0: none were logged", name)
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, kinds, summary) for kinds in (("heading",), ("yaw_rate",), LEVEL))
     speed = Signal(speed.t, np.nan_to_num(speed.value))
@@ -290,7 +289,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         wander = np.maximum(wander, np.ptp(fixes.t) / fixes.size * _before(Signal(fixes.t, shown.std), steps) ** 2)
         at, _ = steps.nearest(fixes.t)
         np.maximum.at(wander, at[at >= 0], shown.moved[at >= 0] / steps.dt)
-    climbs = 0.0 if flat or by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
+    climbs = 0.0 if by_fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     velocity, moves = velocity + absent[:, None], moves + absent[:, None]
     return Member(gnss, velocity, heading, text, False, rate + absent, compass, moves, wander, climbs, alone)
 

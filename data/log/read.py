@@ -263,10 +263,6 @@ def read_log(
     ids = _ids(rows, body, summary)
     carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
-    fixed, high = (rows["kind"].eq(kind).groupby(rows["vehicle"]).transform("sum") for kind in ("x", "z"))
-    few = (2 * high < fixed) & (rows["kind"] == "z")
-    summary.refuse("heights of vehicles with few", rows[few])
-    rows = rows[~few]
     steps = Steps(_grid(rows, dt, body, summary), max_gap, not (rows["kind"] == "z").any(), body, summary, offset)
     arms, tags = (each if isinstance(each, Mapping) else dict.fromkeys(ids, each) for each in (antenna, tag))
     for option, each in (("antenna", arms), ("tag", tags)):
