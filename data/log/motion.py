@@ -84,7 +84,7 @@ class Steps(NamedTuple):
     Attributes:
         grid: (T,) s.
         max_gap: s, of odometry; None as of `longest_gap`.
-        planar: whether heights were not measured, and are 0.
+        height: m, the usual one; NaN where none was measured, and all are 0.
         body: whether speed and yaw rate stay as they were measured.
         summary: counts what is read and what is not.
         offset: as of `read_log`.
@@ -92,7 +92,7 @@ class Steps(NamedTuple):
 
     grid: Floats
     max_gap: float | None
-    planar: bool
+    height: float
     body: bool
     summary: Summary
     offset: Mapping[str, float] = {}
@@ -101,6 +101,11 @@ class Steps(NamedTuple):
     def dt(self) -> float:
         """s."""
         return float(self.grid[1] - self.grid[0])
+
+    @property
+    def planar(self) -> bool:
+        """Whether heights were not measured, and are 0."""
+        return bool(np.isnan(self.height))
 
     def gap(self, t: Floats) -> float:
         """s, the longest gap of samples at times (M,) that is bridged."""
@@ -204,9 +209,9 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
             "Give all numbers of a fix the same t, rounded if need be.",
         )
     if np.isnan(fixes.value).any():
-        fixes.value[:, 2] = 0.0
+        fixes.value[:, 2] = np.nan_to_num(steps.height)
         if not steps.planar:
-            summary.assume("heights of {} are 0: none were logged", name)
+            summary.assume(f"heights of {{}} are {steps.height:.4g} m, the usual one: none were logged", name)
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, kinds, summary) for kinds in (("heading",), ("yaw_rate",), LEVEL))
     speed = Signal(speed.t, np.nan_to_num(speed.value))

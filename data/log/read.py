@@ -263,7 +263,8 @@ def read_log(
     ids = _ids(rows, body, summary)
     carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
-    steps = Steps(_grid(rows, dt, body, summary), max_gap, not (rows["kind"] == "z").any(), body, summary, offset)
+    height = only(rows, "z")["value"].median()
+    steps = Steps(_grid(rows, dt, body, summary), max_gap, height, body, summary, offset)
     arms, tags = (each if isinstance(each, Mapping) else dict.fromkeys(ids, each) for each in (antenna, tag))
     for option, each in (("antenna", arms), ("tag", tags)):
         columns_of(option, [*named(option, each, f"Give {option}={{name: (forward, left, up)}}.")], ids)
