@@ -339,7 +339,9 @@ def test_noisy_fixes_at_a_high_rate_have_no_speed_of_their_own(tmp_path, std):
     """588 m/s from one to the next; of days the speed is one."""
     t = arange(0, 20, 0.01)
     x, y = default_rng(0).normal(0, 3.5, (2, len(t)))
-    drive = pd.DataFrame({"t": t, "x": 10 * t + x, "x_std": std, "y": y, "vx": 10.0, "vy": 0.0})
-    assert read_log(write(drive, tmp_path / "a.csv")).summary.read["fixes"] == len(t)
+    drive = pd.DataFrame({"t": t, "x": 10 * t + x, "x_std": std, "y": y, "z": x, "vx": 10.0, "vy": 0.0})
+    log = read_log(write(drive, tmp_path / "a.csv"))
+    assert log.summary.read["fixes"] == len(t)
+    assert log.recording.sensors.gnss_std[2] == pytest.approx(3.5, rel=0.1)  # which fixes show
     with refused(r"a typical speed of [89].*e\+05 m/s"):
         read_log(write(drive.assign(t=t / 86400), tmp_path / "a.csv"))

@@ -274,8 +274,8 @@ def _of_filters(c: Check, named: Sequence[str]) -> Iterator[str]:
         if row["misses"] == "filter errs" or row["vehicle"] not in explained:
             yield (
                 f"{row['vehicle']}: its {row['misses']} by up to {row['per_std']:.1f} times its standard deviation "
-                f"from {row['worst_from_s']:.3g} to {row['worst_to_s']:.3g} s: see the other lines, or the stated "
-                "noise is wrong."
+                f"from {row['worst_from_s']:.3g} to {row['worst_to_s']:.3g} s: see the other lines, or the noise "
+                "that is stated or assumed is wrong."
             )
     usual = pd.Series(c.normalised.ravel()).median() < CONFIDENT_RATIO  # else the noise is understated throughout
     if usual and len(rows) == len(c.vehicles) > 1 and np.ptp(begins) < 0.2 * np.ptp(c.world.t):
@@ -371,7 +371,7 @@ def _of_vehicle(c: Check, row: Row) -> list[str]:
     elif nis is not None and row["fixes"] > LEAST_COUNT and not 0.2 <= nis <= most:
         say(
             f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {nis**0.5:.2g} times as large "
-            "as stated, or correlated in time. Give std columns in m, or sensors=."
+            "as stated or assumed, or correlated in time. Give std columns in m, or sensors=."
             + " Were variances given as deviations?"
             * bool(0.8 < nis * c.fix_noise / 2**0.5 < 1.25)
         )

@@ -62,6 +62,8 @@ DISORDER_SHARE = 0.02
 """Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
 EQUAL_LOG_FACTOR = 0.1
 """Logarithm of a factor of deviations that is none."""
+BENT_STDS = 1.15 * 6**0.5
+"""Standard deviations of heights that three quarters of their second differences, which no slope changes, are below."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
 
@@ -248,7 +250,8 @@ def _nowhere(rows: Rows) -> Bools:
 def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: float) -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
-    A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
+    A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported;
+    heights err as fixes show, if that is more.
 
     Args:
         rows: in SI units and metres.
@@ -272,6 +275,8 @@ def assumed(rows: Rows, steps: "Steps", members: "Sequence[Member]", drifts: flo
     for kind, std in usual[usual > DEGREES_STD].items():
         assume(f"{TOO_WIDE} {kind} are {std:.3g} rad: if they are degrees, std={kind}:{DEGREE * std:.3g} mends it")
     x, y, z = base.gnss_std
+    bent = [pd.Series(member.gnss[:, 2]).dropna().diff().diff().abs().quantile(0.75) for member in members]
+    z = max(z, *np.divide(bent, BENT_STDS))
     up = PLANE_STD if steps.planar else of(z, "m", "z")
     noise: dict[str, Any] = {
         "gnss_std": (of(x, "m", "x"), of(y, "m", "y"), up),
