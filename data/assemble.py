@@ -230,7 +230,7 @@ def check_time(t: Floats, file: str, column: str = "t") -> None:
             f"{file}: column {column}",
             f"{late[0]:.15g}",
             "must be seconds: it looks like milliseconds or nanoseconds since 1970",
-            "Pass scale=t:1e-3 or t:1e-9, or store dates.",
+            "Pass scale=t:1e-3 or t:1e-9 if all files are so, the truth, too; or store seconds or dates.",
         )
 
 
@@ -244,8 +244,8 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
             f"{file}: column t with dt = {dt:g} s",
             f"{steps:.3g} steps of {vehicles} vehicles for {rows} rows",
             f"must be at most {MAX_INSTANTS_PER_ROW} instants a row",
-            "Check that t is in seconds (not nanoseconds or milliseconds) and the same for all numbers of a sample, or "
-            "take a longer dt.",
+            "Check that t is in seconds (not nanoseconds or milliseconds) and the same for all numbers of a sample, "
+            "correct rows whose clock was not set (of a bag stamps=received), or take a longer dt.",
         )
 
 

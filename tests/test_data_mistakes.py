@@ -157,11 +157,16 @@ def test_the_good_file_is_good(tmp_path):
 
 def test_a_row_that_comes_late_changes_nothing_and_is_named(tmp_path):
     late = "0.5,red,x,,4.0,1.5,\n"
-    for name, text in (("a.csv", GOOD), ("b.csv", swap(late, "") + late)):
-        (tmp_path / name).write_text(text)
+    texts = {"a": GOOD, "b": swap(late, "") + late, "c": GOOD + "9e9,red,x,,4.0,1.5,\n", "d": nanoseconds(WIDE)}
+    for name, text in texts.items():
+        (tmp_path / f"{name}.csv").write_text(text)
     a, b = (read_log(tmp_path / name) for name in ("a.csv", "b.csv"))
     assert same(a.recording, b.recording)
     assert "stamps of red go back (first: b.csv: row 200)" in str(b.summary)
+    with refused("c.csv: row 201, t = 9000000000 s"):
+        read_log(tmp_path / "c.csv")
+    with refused("d.csv: column t .* if all files are so"):
+        read_log(tmp_path / "a.csv", truth=tmp_path / "d.csv")
 
 
 KEPT: dict[str, tuple[Callable[[str], str], str]] = {

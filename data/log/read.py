@@ -54,6 +54,7 @@ from .units import (
     in_group,
     not_vague,
     only,
+    row_of,
     stated_std,
     without_codes,
 )
@@ -240,7 +241,8 @@ def read_log(
     rows = rows.assign(value=rows["value"] - less)
     check_values(rows)
     for column in ("t", "arrival"):
-        check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
+        for file, times in rows[column].where(np.isfinite).groupby(rows["file"]):
+            check_time(times.to_numpy(), str(file), column)
     check_one_drive(rows, path.name)
     if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
@@ -436,7 +438,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         return float(times.agg(lambda t: t.diff().median())[times.size() >= FREQUENT_SHARE * times.size().max()].min())
 
     moves, fixes, pairs = map(densest, ("odometry", "fix", "relative"))
-    t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
+    t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], max(0.0, moves)
     begin = float(t.min())
     span = t.max() - begin
     if not span:
@@ -446,7 +448,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
             "must hold two instants or more",
             "Is the file complete?",
         )
-    step = dt or float(f"{max(moves if moves > 0 else fixes, SHORTEST_STEP):.3g}")
+    step = dt or float(f"{max(summary.odometry or fixes, SHORTEST_STEP):.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
     if dt is None:
@@ -463,7 +465,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
                 f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged"
             )
             step = seldom
-        at = only(rows, "x").drop_duplicates(["vehicle", "t"])
+        at = only(rows, "x")
 
         def lost(step: float) -> float:
             steps = at.assign(t=((at["t"] - begin + SAME_INSTANT) / step).round())
@@ -473,7 +475,14 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         if parts > 1:
             step = float(f"{step / parts:.3g}")
             summary.assume(f"steps of {step:g} s, since fixes come at two rates or more")
-    check_size(span / step + 1.5, rows["vehicle"].nunique(), len(rows), step, summary.name)
+    far: Any = (t - t.median()).abs().idxmax()
+    check_size(
+        span / step + 1.5,
+        rows["vehicle"].nunique(),
+        len(rows),
+        step,
+        f"{row_of(rows.loc[[far]])}, t = {t[far]:.10g} s, farthest from the median",
+    )
     if span / step < 0.5:
         raise InputError("dt", f"{step:g} s", f"must be well below the {span:g} s of the log", "Take a shorter dt.")
     return begin + step * np.arange(int(span / step + 1.5))
@@ -492,8 +501,9 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
             f"must name vehicles of the log: {', '.join(ids)}",
             "Rename them, or leave the truth out: its file, or by ignore= its topic.",
         )
-    if rows["t"].max() < 2 * DAY_S:  # seconds of the day, as of NMEA without a date, are of the day of the log
-        rows = rows.assign(t=rows["t"] + DAY_S * round((steps.mean() - rows["t"].mean()) / DAY_S))
+    stamps = rows["t"]
+    if stamps.max() < 2 * DAY_S:  # seconds of the day, as of NMEA without a date, are of the day of the log
+        rows = rows.assign(t=stamps + DAY_S * round((steps.mean() - stamps.mean()) / DAY_S))
     axes = 3 if (rows["kind"] == "z").any() else 2
     heights = pd.DataFrame(recording.gnss[0, ..., 2])
     heights = heights.rolling(round(20.0 / recording.dt) + 1, 1, center=True).mean().interpolate(limit_direction="both")
@@ -524,9 +534,9 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, s
     if not there.any():
         raise InputError(
             f"{file}: column t",
-            f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s",
+            f"{stamps.min():.10g} to {stamps.max():.10g} s",
             f"must overlap the log, from {steps[0]:.10g} to {steps[-1]:.10g} s",
-            "Does its clock or its date differ?",
+            "Does its clock or its date differ? scale=t: is of both.",
         )
     if axes == 2:
         position[..., 2] = heights.fillna(0.0).where(there)
