@@ -184,7 +184,7 @@ def runs_in_memory(runs: object, per_run: int) -> int:
 
     >>> runs_in_memory(10**15, 1000)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
-    coopoc.errors.InputError: runs = 1000000000000000: must be in 1.. ...
+    coopoc.errors.InputError: runs = 1000000000000000: must be in 1...
     """
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
     hint = "A recording must fit into memory: make several of fewer runs, each with its seed, or take fewer vehicles."

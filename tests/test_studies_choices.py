@@ -37,7 +37,7 @@ def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path, short
     for wrong, said in (
         ({"method": "kalman,jont"}, r"method = 'jont': must be one of .* Did you mean joint\?"),
         ({"runs": 10**9}, r"runs = 1000000000: must be in 1..\d"),
-        ({"seed": -1}, r"seed = -1: must be in 0"),
+        ({"seed": -1}, "seed = -1: must be >= 0"),
         ({"method": "okf", "train_seeds": 10**9}, r"train_seeds = 1000000000: must be in 1..1000"),
         ({"noise_model": "nominl"}, r"Did you mean nominal\?"),
         ({"rate_hz": 0}, r"rate = 0: must be > 0"),

@@ -145,7 +145,8 @@ def drive(f: Filter, model: Model, k: int, moved: Numbers, dt: float) -> None:
         return
     i, n, level = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(f.ego[LEVEL + MOTIONS])
     sure = g.x[i] ** 2 / (g.p[i, i] + TINY) + g.x[i + 1] ** 2 / (g.p[i + 1, i + 1] + TINY)
-    keep = math.exp(-level * level * min(max(sure, 1.0), MOST_SURE) * dt / model.lasts)
+    most = MOST_SURE if model.fix_gate > 0.0 else 1.0
+    keep = math.exp(-level * level * min(max(sure, 1.0), most) * dt / model.lasts)
     for c in range(2):
         for j in range(n):
             g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
