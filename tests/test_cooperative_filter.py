@@ -8,7 +8,7 @@ from functools import partial as partial_of
 import numpy as np
 import pytest
 from conftest import holed, slow_fixes, textbook, winding
-from numpy import nan
+from numpy import arange, array, concatenate, nan, where
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
@@ -59,7 +59,7 @@ def test_with_everything_off_it_is_the_joint_filter(change):
     linear: at the prediction, or at a solution."""
     fleet, fine = winding(80, vehicles=5), replace(S2, gnss_std=(0.01,) * 3, range_std=0.02, velocity_std_ratio=0.01)
     fine = replace(fine, azimuth_std=0.002, inclination_std=0.002)
-    apart = replace(fleet, position=fleet.position + np.arange(5.0)[:, None] * [20.0, 10.0, 0.4])
+    apart = replace(fleet, position=fleet.position + arange(5.0)[:, None] * [20.0, 10.0, 0.4])
     seen = change(observe(apart, fine, V2X(20, radius=1e4), runs=2, observers=[0, 3]))
     ours, joint = CooperativeFilter(priors=AS_STATED)(seen, [0, 3]), textbook(JointFilter())(seen, [0, 3])
     assert_allclose(ours.x, joint.x, atol=2e-5)
@@ -73,7 +73,7 @@ def assert_is_the_oracle(track, seen, priors=Priors()):
         assert_allclose(track.x[run, :, 0], x, atol=1e-6)
         assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
         if len(track.neighbours[run]):
-            assert_allclose(track.neighbours[run][-len(np.concatenate(others)) :], np.concatenate(others), atol=2e-6)
+            assert_allclose(track.neighbours[run][-len(concatenate(others)) :], concatenate(others), atol=2e-6)
 
 
 def mean_errors(seen, fleet, egos, *others):
@@ -83,9 +83,9 @@ def mean_errors(seen, fleet, egos, *others):
 
 def too_long(seen, share=0.05):
     """Ranges as behind a corner."""
-    rng, relative = default_rng(1), np.array(seen.relative)
+    rng, relative = default_rng(1), array(seen.relative)
     hit = rng.random(relative.shape[:2]) < share
-    relative[..., 0] += np.where(hit, rng.uniform(3, 20, hit.shape), 0)
+    relative[..., 0] += where(hit, rng.uniform(3, 20, hit.shape), 0)
     return replace(seen, relative=relative)
 
 
@@ -128,7 +128,7 @@ def test_an_offset_of_all_ranges_is_a_state():
         assert_allclose(mine - mine[:, :1], 0.0, atol=1e-9)
     assert 0.3 < added[:, [0, -1]].std() < 3.0
     assert_allclose(longer.relative[..., 1:], seen.relative[..., 1:], atol=0)
-    wrong = replace(seen, relative=seen.relative + np.array([3.0, 0.0, 0.0]))
+    wrong = replace(seen, relative=seen.relative + array([3.0, 0.0, 0.0]))
     cases = (None, seen), (None, wrong), (NoiseModel.nominal(told), wrong)
     clean, taken, state = (
         float(rt_le(CooperativeFilter(model or "nominal")(given), fleet).mean()) for model, given in cases
@@ -141,7 +141,7 @@ def test_inclinations_alone_do_not_lose_the_ego():
     """Near a fix of 3.5 m they are not linear: taken for it they left vehicles 7 to 12 m off; Kalman is the referee."""
     fleet = load_fleet("town10").between(0, 200)
     seen = observe(fleet, S2, V2X(6), runs=6, seed=1, observers=[12, 24, 36])
-    flat = replace(seen, relative=np.where([False, False, True], seen.relative, nan))
+    flat = replace(seen, relative=where([False, False, True], seen.relative, nan))
     ours, alone = (rt_le(m(flat, [12, 24, 36]), fleet) for m in (CooperativeFilter(), Kalman()))
     assert ours.mean() < 1.05 * alone.mean()
     assert (ours < 2.0 * alone).all()
@@ -238,7 +238,7 @@ def test_one_wrong_fix_at_first_is_outvoted(most, wrong, step):
     relative, late = seen.relative.copy(), 10 // step * (2 * len(wrong) if wrong[0] == 0 else 0)
     relative[..., 1:] = nan
     for off in (30.0, 600.0):
-        off_then = moved(seen, 10 // step * np.array(wrong), 24, [0.8 * off, -0.6 * off, 0.0])
+        off_then = moved(seen, 10 // step * array(wrong), 24, [0.8 * off, -0.6 * off, 0.0])
         for m in (Kalman(), JointFilter(), CooperativeFilter(), CovarianceIntersection(split=True)):
             for sees in (seen.relative, relative):
                 assert errors(m(replace(off_then, relative=sees), [24]), fleet)[:, late:].max() < 8.0
@@ -270,7 +270,7 @@ def test_fixes_that_drift_away_and_return_are_followed_back(priors, step):
     sensors = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02)
     seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=6, observers=[24]), 10 // step)
     gnss, relative, t = seen.gnss.copy(), seen.relative.copy(), fleet.t - fleet.t[0]
-    gnss[:, :, 24, 0] += np.where((t >= 20) & (t < 40), 3.0 * (t - 20), 0.0)
+    gnss[:, :, 24, 0] += where((t >= 20) & (t < 40), 3.0 * (t - 20), 0.0)
     relative[..., 1:] = nan
     track = CooperativeFilter(priors=priors)(replace(seen, gnss=gnss, relative=relative), [24])
     assert errors(track, fleet)[:, 500 // step :].mean() < 1.8
@@ -328,9 +328,9 @@ def test_odometries_that_err_alike_do_not_outweigh_fixes(ego, reverse):
     fleet = every(load_fleet("town10").between(0, 900), 5)
     sensors, t = replace(S2, gnss_std=(1.0,) * 3, velocity_std_ratio=0.02, range_std=0.3), fleet.t - fleet.t[0]
     seen = slow_fixes(observe(fleet, sensors, V2X(1, radius=1e4), runs=3, observers=[ego]), 2)
-    signs = np.where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
-    velocity = seen.velocity * signs if reverse else seen.velocity + np.array([3.0, 0.0, 0.0])
-    ranges = np.where([True, False, False], seen.relative, nan)
+    signs = where((t >= 20) & (t < 45), -1.0, 1.0)[:, None, None]
+    velocity = seen.velocity * signs if reverse else seen.velocity + array([3.0, 0.0, 0.0])
+    ranges = where([True, False, False], seen.relative, nan)
     track = CooperativeFilter(priors=ON_ROADS)(replace(seen, velocity=velocity, relative=ranges), [ego])
     assert errors(track, fleet)[:, 100:].mean() < 2.5
 
@@ -354,7 +354,7 @@ def test_a_fix_counts_as_wrong_where_slipping_cannot_explain_it(vehicles):
     innovation below 2 m counted as wrong."""
     fleet = winding(600, 0.3, 7.0, vehicles)
     seen = observe(fleet, Sensors(gnss_std=(0.05,) * 3, range_std=0.05), V2X(vehicles - 1), runs=3)
-    jumped = replace(seen, gnss=seen.gnss + (np.arange(600) % 50 >= 40)[:, None, None])
+    jumped = replace(seen, gnss=seen.gnss + (arange(600) % 50 >= 40)[:, None, None])
     track = CooperativeFilter()(jumped)
     assert rt_le(track, fleet).max() < 0.03
     if vehicles == 1:
@@ -388,7 +388,7 @@ def test_a_lost_message_costs_no_more_than_the_message():
 
 def mirrored(recording):
     """Ranges in another unit, azimuths of another sign; a fix of the ego each second."""
-    seldom = moved(recording, np.arange(len(recording.t)) % 10 > 0, 0, nan)
+    seldom = moved(recording, arange(len(recording.t)) % 10 > 0, 0, nan)
     return replace(seldom, relative=recording.relative * [2.0, -1.0, 1.0])
 
 
@@ -459,7 +459,7 @@ def test_step_by_step_it_is_the_track(crossing, case):
     streams = {j: start() for j in range(len(seen.ids))}
     sent, trusted = dict[tuple[int, int], Broadcast | None](), set[bool]()
     for t in range(len(seen.t)):
-        here = np.arange(box.start[t], box.start[t + 1])
+        here = arange(box.start[t], box.start[t + 1])
         for j, stream in streams.items():
             if j and np.isfinite(seen.velocity[0, t, j, 0]):
                 stream.step(seen.gnss[0, t, j], seen.velocity[0, t, j], seen.dt)
@@ -499,7 +499,7 @@ def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured():
     moving = fleet.select(np.flatnonzero(fleet.present.all(0)))
     moving = replace(moving, velocity=np.gradient(moving.position, fleet.dt, axis=0))
     seen = observe(moving, S2, V2X(4, radius=60.0, loss=0.35), runs=4, observers=[0, 1, 2])
-    links = np.concatenate([seen.links.of(ego) for ego in range(3)])
+    links = concatenate([seen.links.of(ego) for ego in range(3)])
     truth = moving.position[seen.links.step[links], seen.links.neighbour[links]]
     ours, joint = (method(seen, [0, 1, 2]).neighbours - truth for method in (CooperativeFilter(), JointFilter()))
     assert np.nanmean(ours**2) < 1.1**2 * np.nanmean(joint**2)
@@ -539,7 +539,7 @@ def test_clocks_of_neighbours_are_found(priors):
     are right. Both are the same drive with the same draws."""
     fleet = drive(300)
     seen = observe(fleet, replace(S2, gnss_std=(0.5,) * 3), V2X(6), runs=3, seed=4, observers=[0, 7])
-    who = np.setdiff1d(np.arange(len(fleet.ids)), [0, 7])[::3]
+    who = np.setdiff1d(arange(len(fleet.ids)), [0, 7])[::3]
     late = delayed(seen, who, 5, 0)
     usual, found, without = (
         method(recording, [0, 7])
@@ -551,7 +551,7 @@ def test_clocks_of_neighbours_are_found(priors):
     )
     best, ours, worse = (rt_le(track, fleet).mean() for track in (usual, found, without))
     assert ours - best < 0.5 * (worse - best)
-    links = np.concatenate([late.links.of(ego) for ego in (0, 7)])
+    links = concatenate([late.links.of(ego) for ego in (0, 7)])
     known, wrong = late.links.step[links] > 150, np.isin(late.links.neighbour[links], who)
     assert 0.2 < np.median(found.extras["clock"][:, known & wrong]) < 0.6
     assert np.percentile(abs(found.extras["clock"][:, known & ~wrong]), 90) < 1e-3

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import DESCENTS
-from numpy import pi
+from numpy import arange, array, pi, zeros
 from numpy.linalg import norm
 from numpy.random import default_rng
 from random_graphs import random_drive, scipys
@@ -41,7 +41,7 @@ def test_landmarks_beside_a_plane_are_mirrored(seed):
     found, costs = solve(problem), list[float]()
     for sides in np.ndindex(2, 2, 2):
         x = found.x.copy()
-        x[60:, 2] = abs(x[60:, 2]) * (2 * np.array(sides) - 1)
+        x[60:, 2] = abs(x[60:, 2]) * (2 * array(sides) - 1)
         end = solve(replace(problem, x0=x, search=Search()), throw=False)
         assert "minimum" in str(end.notes) or end.cost <= found.cost * (1 + 1e-4)
         costs.append(end.cost)
@@ -111,7 +111,7 @@ def test_exact_ranges_end_at_the_truth_without_a_word():
     z = norm(np.diff(truth[pairs], axis=1), axis=(1, 2))
     problem = problem.add("range", pairs, z, std=0.1)
     found = solve(problem)
-    assert ranges_of(problem, truth).cost(z[:, None], np.arange(28)) == 0.0
+    assert ranges_of(problem, truth).cost(z[:, None], arange(28)) == 0.0
     assert abs(found.x - truth).max() < 1e-6
     assert not found.notes
 
@@ -148,9 +148,9 @@ def test_robust_solves_find_what_the_truth_leads_to(seed):
 
 def test_rejecting_a_quarter_is_doubtful():
     """Closed form: of 8 fixes of a point 3 are 50 m off."""
-    z = np.zeros((8, 3))
+    z = zeros((8, 3))
     z[:3] = 50.0
-    problem = Problem([*"a"]).add("position", ["a"] * 8, z + 1e-3 * np.arange(24).reshape(8, 3), std=1.0)
+    problem = Problem([*"a"]).add("position", ["a"] * 8, z + 1e-3 * arange(24).reshape(8, 3), std=1.0)
     assert solve_gnc(problem, [0]).notes[0].startswith("DOUBTFUL: GNC rejects 3 of 8 candidates")
 
 
@@ -158,10 +158,10 @@ def test_a_loss_rejects_what_least_squares_need_not():
     """No loop is beyond 2 where all count, but without one of them the cost is 7.23, not 8.36."""
     problem = from_graph(random_drive(42, steps=15, loops=8), "geodesic")
     (every,), [(_, loops)] = problem.factors, loop_closures(problem)
-    odometry, closing = (taken(every, rows) for rows in (np.setdiff1d(np.arange(len(every.nodes)), loops), loops))
+    odometry, closing = (taken(every, rows) for rows in (np.setdiff1d(arange(len(every.nodes)), loops), loops))
     found = solve(replace(problem, factors=(odometry, replace(closing, loss=Loss("truncated", 2.0)))))
     for k in range(len(loops)):
-        rest = taken(closing, np.delete(np.arange(len(loops)), k))
+        rest = taken(closing, np.delete(arange(len(loops)), k))
         assert found.cost <= (solve(replace(problem, factors=(odometry, rest))).cost + 2.0) * (1 + 1e-6)
 
 
@@ -184,17 +184,17 @@ def test_drones_that_range_landmarks_end_as_low_as_from_the_truth_or_say_so(seed
 def test_a_walk_counts_beyond_what_32_bits_hold():
     """Key a n + b of a pair in a graph of 50,000 poses; against the steps of 1 m of the ring that is driven."""
     n = 50_000
-    position, _, known = walk(ring(n, 0.0), np.ones(n, bool), [(0, np.zeros(2), np.eye(2))])
+    position, _, known = walk(ring(n, 0.0), np.ones(n, bool), [(0, zeros(2), np.eye(2))])
     assert known.all()
     assert np.allclose(norm(np.diff(position, axis=0), axis=1), 1.0)
 
 
 def ring(n, wrong):
     """A drive round a circle whose turns are `wrong` by this in all, and its closure."""
-    edge, turn = np.c_[np.arange(n), np.roll(np.arange(n), -1)], (2 * pi + wrong) / n
+    edge, turn = np.c_[arange(n), np.roll(arange(n), -1)], (2 * pi + wrong) / n
     moved = PoseEdges(edge, np.tile([1.0, 0], (n, 1)), np.full((n, 1), turn), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     names = tuple(f"A{k}" for k in range(n))
-    return Graph(2, names, np.ones(n, bool), np.full((n, 2), np.nan), np.zeros((n, 1)), relative_pose=moved)
+    return Graph(2, names, np.ones(n, bool), np.full((n, 2), np.nan), zeros((n, 1)), relative_pose=moved)
 
 
 def test_the_tree_shares_what_a_loop_does_not_close():
@@ -207,7 +207,7 @@ def test_the_tree_shares_what_a_loop_does_not_close():
 def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
     """Errors of a ring that sum to 1.5 rad, of two thousand that sum to thousands, or to a whole turn."""
     problem, space = from_graph(ring(2000, 0.0), start="odometry"), Space(2, has_rotation=True)
-    course = 2 * pi * np.arange(2000) / 2000
+    course = 2 * pi * arange(2000) / 2000
     shaken = course + 0.5 * default_rng(0).choice([-1.0, 1.0], 2000)
     for turns, expected in (
         (course, True),
@@ -215,7 +215,7 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
         (shaken, True),
         (0 * course, False),
     ):
-        wound = rewound(problem, space.join(np.zeros((2000, 2)), exp(turns[:, None])), 0.0)
+        wound = rewound(problem, space.join(zeros((2000, 2)), exp(turns[:, None])), 0.0)
         assert (next(wound, None) is None) is expected
 
 
@@ -232,7 +232,7 @@ def test_no_turn_is_averaged_that_a_bound_excludes(d, seed, monkeypatch):
 
 def test_points_with_vague_fixes_are_mirrored_together():
     """Closed form: fixes prefer the other side of the line through two towers by 10 / 81."""
-    pairs, x = np.array([(0, 2), (1, 2), (0, 3), (1, 3), (2, 3)]), np.array([[0, 0], [9, 0], [4, 3], [6, 2.0]])
+    pairs, x = array([(0, 2), (1, 2), (0, 3), (1, 3), (2, 3)]), array([[0, 0], [9, 0], [4, 3], [6, 2.0]])
     apart = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
     problem = Problem([*"abcd"], x0=x, dimension=2, fixed=[*"ab"]).add("position", [2, 3], [[4, -1], [6, -1]], std=9.0)
     problem = problem.add("range", pairs, apart, std=0.01)
@@ -289,6 +289,6 @@ def test_robots_that_see_one_another_turn_to_what_they_see(d):
     problem = problem.add("position", range(6), truth[:, :d] + rng.normal(0, 2, (6, d)), std=2.0)
     pairs = [(i, (i + k) % 6) for i in range(6) for k in (1, 3)]
     exact = problem.add("body_spherical", pairs, np.ones((12, d)), std=1.0).linearise(truth).residual[-1] + 1.0
-    std = np.array([0.2, 0.03, 0.03])[:d]
+    std = array([0.2, 0.03, 0.03])[:d]
     problem = problem.add("body_spherical", pairs, exact + std * rng.normal(size=exact.shape), std=std)
     assert solve(replace(problem, x0=None)).cost < 1.0001 * solve(problem).cost

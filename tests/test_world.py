@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import among, refused, standing
-from numpy import nan, pi
+from numpy import arange, array, array_equal, nan, pi
 from numpy.random import Generator, Philox, SeedSequence, default_rng
 from scipy import stats
 from test_methods import SILENT
@@ -70,7 +70,7 @@ def test_unknown_vehicle_lists_the_known(crossing):
         (lambda: Sensors(gnss_bias_mode="daily"), "gnss_bias_mode"),
         (lambda: Sensors(velocity_std_ratio=float("nan")), "velocity_std_ratio"),
         (lambda: Sensors(velocity_std_ratio=15), "velocity_std_ratio = 15: must be in .0, 1., 0.15 for 15 %"),
-        (lambda: PoseFilter("solo", assumed=S2).start(0.1, np.array([0, 0, 0, 90.0])), "begin.0. = 90"),
+        (lambda: PoseFilter("solo", assumed=S2).start(0.1, array([0, 0, 0, 90.0])), "begin.0. = 90"),
     ],
 )
 def test_bad_configuration_is_named(build, words):
@@ -80,12 +80,12 @@ def test_bad_configuration_is_named(build, words):
 
 def test_float32_is_refused_and_unwrapped_headings_are_not():
     """Two vehicles that circle for nearly five turns; degrees are refused with all other mistakes (test_misuse)."""
-    t = np.arange(300) / 10
+    t = arange(300) / 10
     turn = np.c_[t, -t]
     circles = np.stack([9 * np.sin(turn), -9 * np.cos(turn), 0 * turn], axis=2)
-    fleet = Fleet(("a", "b"), t, circles, np.gradient(circles, 0.1, axis=0), heading=turn + np.array([0, pi]))
+    fleet = Fleet(("a", "b"), t, circles, np.gradient(circles, 0.1, axis=0), heading=turn + array([0, pi]))
     with refused(r"position.*float32, which are 0.5 m apart.*Subtract a local origin"):
-        replace(fleet, position=(circles + np.array([5e5, 5.8e6, 0])).astype(np.float32))
+        replace(fleet, position=(circles + array([5e5, 5.8e6, 0])).astype(np.float32))
     late = observe(fleet, S2, V2X(2), frame="body").between(200, 300)
     body = late.body
     unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * pi))
@@ -115,7 +115,7 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
         assert re.search(note, doubt)
         method = JointFilter() if recording.body is None else PoseFilter("solo", begin=np.zeros((60, 4)))
         assert {*recording.notes} & {*method(recording, [8]).notes} == {doubt}
-    knots = np.where(np.arange(60)[:, None] == 3, 1.94, 1.0)
+    knots = np.where(arange(60)[:, None] == 3, 1.94, 1.0)
     (note,) = observe(replace(town, velocity=knots * town.velocity), S2, V2X(2), observers=[8]).notes
     assert f"velocities of ['{town.ids[3]}'] contradict positions" in note
     mended = replace(recording, sensors=S2)
@@ -125,27 +125,27 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
 def test_zero_noise_may_act_but_not_be_assumed(crossing):
     with refused(r"gnss_std.*assumed=Sensors"):
         observe(crossing, SILENT)
-    assert np.array_equal(observe(crossing, SILENT, assumed=S2).gnss[0], crossing.position)
+    assert array_equal(observe(crossing, SILENT, assumed=S2).gnss[0], crossing.position)
 
 
 def test_draws_belong_to_their_key(crossing):
     """30 runs are a prefix of 100, K = 2 a part of K = 6, a smaller fleet keeps its draws."""
     few = observe(crossing, S2, V2X(max_neighbours=2), runs=3, seed=5)
     many = observe(crossing, S2, V2X(max_neighbours=6), runs=5, seed=5)
-    assert np.array_equal(few.gnss, many.gnss[:3])
+    assert array_equal(few.gnss, many.gnss[:3])
     same = among(many.links, few.links)
-    assert np.array_equal(few.relative, many.relative[:3, same])
+    assert array_equal(few.relative, many.relative[:3, same])
     poor = V2X(max_neighbours=6, loss=0.3, burst=3.0, rate=4.0, latency=0.1)
     lossy, fewer = (observe(crossing, S2, replace(poor, max_neighbours=k), runs=r, seed=5) for k, r in ((6, 5), (2, 3)))
-    assert np.array_equal(fewer.arrival, lossy.arrival[:3, same])
-    assert np.array_equal(observe(crossing.select(["c3", "c1"]), S2, runs=3, seed=5).gnss[:, :, 0], few.gnss[:, :, 3])
-    assert not np.array_equal(observe(crossing, S2, runs=3, seed=6).gnss, few.gnss)
+    assert array_equal(fewer.arrival, lossy.arrival[:3, same])
+    assert array_equal(observe(crossing.select(["c3", "c1"]), S2, runs=3, seed=5).gnss[:, :, 0], few.gnss[:, :, 3])
+    assert not array_equal(observe(crossing, S2, runs=3, seed=6).gnss, few.gnss)
 
 
 def test_noise_has_the_stated_moments():
     """Independent check: SciPy's Kolmogorov-Smirnov test against the normal and uniform distributions."""
-    apart = np.broadcast_to(np.array([[0.0, 0, 0], [20, 0, 0]]), (400, 2, 3))
-    fleet = Fleet(("a", "b"), np.arange(400) * 0.1, apart, np.full((400, 2, 3), 8.0))
+    apart = np.broadcast_to(array([[0.0, 0, 0], [20, 0, 0]]), (400, 2, 3))
+    fleet = Fleet(("a", "b"), arange(400) * 0.1, apart, np.full((400, 2, 3), 8.0))
     sensors = replace(Sensors.paper_scenario1(), gnss_bias=(0.0, 0.0))
     recording = observe(fleet, sensors, V2X(max_neighbours=1), runs=20)
     for draws, std in (
@@ -163,7 +163,7 @@ def test_noise_has_the_stated_moments():
 
 
 def test_velocity_readings():
-    velocity = np.array([3.0, 4.0, 0.0])
+    velocity = array([3.0, 4.0, 0.0])
     assert Sensors(velocity_reading="axis").velocity_std(velocity) == pytest.approx([0.3, 0.4, 0.0])
     assert Sensors(velocity_reading="speed").velocity_std(velocity) == pytest.approx([0.5, 0.5, 0.5])
     assert Sensors().motion_std(velocity[None, None, None], 0.1)[0, 0, 0, 2] == pytest.approx(0.005)
@@ -171,7 +171,7 @@ def test_velocity_readings():
 
 def test_vector_cov_against_sampling():
     """Independent check: the sample covariance of converted draws (small angles, so that first order holds)."""
-    relative, std = np.array([25.0, 0.7, 1.3]), np.array([0.3, 0.01, 0.02])
+    relative, std = array([25.0, 0.7, 1.3]), array([0.3, 0.01, 0.02])
     draws = to_vector(relative + default_rng(1).standard_normal((200_000, 3)) * std)
     assert vector_cov(relative, std) == pytest.approx(np.cov(draws.T), abs=2e-3)
 
@@ -196,7 +196,7 @@ def test_loss_delay_and_rate_act_on_messages(formation):
     assert box.sent_bytes == 200 * 32
     assert lossy.received_bytes.mean() == pytest.approx(0.7 * 200 * 4 * 32, rel=0.05)
     assert np.ptp(lossy.received_bytes) > 0
-    at = np.repeat(np.arange(200), np.diff(late.start))
+    at = np.repeat(arange(200), np.diff(late.start))
     assert (late.newest[0, at >= 3] == at[at >= 3] - 3).all()
     assert (late.newest[0, at < 3] == -1).all()
     assert slow.received_bytes[0] == pytest.approx(200 * 4 * 32 / 5, rel=0.05)
@@ -221,7 +221,7 @@ def test_unknown_and_unrecorded_egos(crossing):
     with refused("egos"):
         recording.columns(["ghost"])
     assert recording.columns(["c2", 1]) == [2, 1]
-    assert np.array_equal(recording.between(0, 999).arrival, recording.arrival)
+    assert array_equal(recording.between(0, 999).arrival, recording.arrival)
 
 
 @pytest.mark.parametrize(("seed", "run"), [(0, 0), (7, 99), (2**32 - 1, 3), (2**32, 2)])
