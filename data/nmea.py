@@ -61,7 +61,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
     frame = pd.DataFrame.from_dict(sentences.rows, orient="index")
     if FIX[0] not in frame:
         raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA in ASCII", "Save it so, with fixes.")
-    stds = frame.filter(regex="_std$").columns
+    stds = frame.filter(regex="_std$").columns.tolist()
     frame[stds] = frame.groupby("t")[stds].transform("last")
     early = frame["t"] < sentences.first_day  # sentences before the first date
     frame["height"] += frame["separation"].ffill().bfill().fillna(0.0)

@@ -251,11 +251,11 @@ def read_log(
     summary.logged = rows.groupby("vehicle")["kind"].unique().to_dict()
     rows, true_rows = not_vague(rows[measured], summary), rows[~measured]
     rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
-    own = rows[in_group(rows, "fix", "odometry", "heading")]
-    spans = own.groupby(["vehicle", "kind", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
-    for (name, _), span in spans.groupby(["vehicle", "kind"]):
-        if (span["min"] < span["max"].cummax().shift()).any():
-            summary.assume(SEVERAL, f"{name} ({', '.join(sorted(span['file']))})")
+    alone = rows[in_group(rows, "fix", "odometry", "heading")]
+    spans = alone.groupby(["vehicle", "kind", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
+    for (name, _), parts in spans.groupby(["vehicle", "kind"]):
+        if (parts["min"] < parts["max"].cummax().shift()).any():
+            summary.assume(SEVERAL, f"{name} ({', '.join(sorted(parts['file']))})")
     deviations = factors(std, sorted({*kind, *rows["kind"]} - {"message"}), "std")
     stated = {ENU.get(name, KINDS[name].name): abs(KINDS[name].scale) * each for name, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
