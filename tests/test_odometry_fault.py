@@ -99,7 +99,7 @@ def test_odometry_that_errs_a_little(fault, every, beside):
         sqrt(square(m(log, (0, 1)).x - fleet.position)[:, 900:, :, :2].sum(-1).mean())
         for m in (Kalman(), JointFilter(), CooperativeFilter())
     )
-    most = 10.0 if fault == "stands" else 2.3
+    most = 10.0 if fault == "stands" else 2.0
     assert (max(kalman, joint, mine) < most * std) if ships else (mine < 1.1 * kalman)
 
 

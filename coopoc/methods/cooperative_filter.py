@@ -147,9 +147,9 @@ class CooperativeFilter(Checked):
       (`kernels.stars.otherwise`). Where odometry surely errs, half of what successive innovations share is motion's.
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
       $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges (of measured ones also their
-      scale, and an offset of each pair); those of odometry change the faster, the surer they are and the
-      noisier motions are. Each is a state with a wide prior, and the estimate is the average over whether it is 0, by
-      Bayes' rule (`kernels.stars.otherwise`).
+      scale, and an offset of each pair); those of odometry change the faster, the noisier
+      motions are, and those of the ego's the surer they are. Each is a state with a wide prior, and the estimate is the
+      average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
       is kept (`kernels.stars.otherwise`).
     - *The star*: an ego whose fixes and whose star contradict each other goes on alone for a while, where no noise

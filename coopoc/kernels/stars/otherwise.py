@@ -128,8 +128,8 @@ def turned(f: Filter, k: int, moved: Numbers) -> Numbers:
 
 
 MOST_SURE, TINY = 30.0, 1e-12
-"""Times that errors of odometry change faster at most, as their squares are of their variances, since what is there
-drifts; least variance."""
+"""Times that errors of the ego's odometry change faster at most, as their squares are of their variances, since what is
+there drifts; least variance."""
 
 
 @part
@@ -145,7 +145,7 @@ def drive(f: Filter, model: Model, k: int, moved: Numbers, dt: float) -> None:
         return
     i, n, level = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(f.ego[LEVEL + MOTIONS])
     sure = g.x[i] ** 2 / (g.p[i, i] + TINY) + g.x[i + 1] ** 2 / (g.p[i + 1, i + 1] + TINY)
-    most = MOST_SURE if model.fix_gate > 0.0 else 1.0
+    most = MOST_SURE if k == 0 and model.fix_gate > 0.0 else 1.0
     keep = math.exp(-level * level * min(max(sure, 1.0), most) * dt / model.lasts)
     for c in range(2):
         for j in range(n):
