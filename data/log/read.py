@@ -222,11 +222,12 @@ def read_log(
         "stamps": stamps,
     }
     rows = _rows(path, truth, summary, options)
-    vehicle, partner, kind = (rows[name] for name in ("vehicle", "partner", "kind"))
+    groups = rows.groupby(["vehicle", "partner", "kind"], sort=False, dropna=False)
+    vehicle, partner, kind = (groups.head(1)[name] for name in ("vehicle", "partner", "kind"))
     own, quantity = vehicle + "." + kind, kind.map(KIND_TABLE["name"])
     of_one, names = vehicle + "." + quantity, {*kind, *own}
     factor = factors(scale, sorted({"t", *names, *quantity, *of_one}))
-    by_kind = pd.Series(1.0, rows.index)
+    by_kind = pd.Series(1.0, kind.index)
     for logged, like in ((kind, quantity), (own, of_one)):
         for key in (like.mask(like.isin(logged)), logged):
             by_kind = key.map(factor).fillna(by_kind)
@@ -235,6 +236,7 @@ def read_log(
         key = key.mask((kind == "range") & pair.isin(offset), pair)
     names |= {*key, "vx", "vy", *(vehicle + ".vx"), *(vehicle + ".vy")}
     less = key.map(factors(offset, sorted(names), "offset")).fillna(0.0)
+    by_kind, less = (each.iloc[groups.ngroup()].set_axis(rows.index) for each in (by_kind, less))
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = without_codes(unwrapped(rows, summary), summary)
