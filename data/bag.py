@@ -29,8 +29,8 @@ pose.orientation.y pose.orientation.z pose.orientation.w",
     "sensor_msgs/msg/Range": "range range min_range max_range",
 }
 """Type of a message -> what it is, and its fields that are read."""
-TRUTH_NAME = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
-"""Stem of a file, or part of a topic, that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
+TRUE_NAME = re.compile(r"(^|[_ -])(ground[_ -]?)?(truth|gt)(?=$|[_ -])", re.IGNORECASE)
+"""In the stem of a file, or part of a topic, that holds a truth, as truth, span_truth, groundtruth_car1 or robot_GT."""
 KINDS_OF_FIELDS = "altitude=height position_covariance_0=longitude_std position_covariance_4=latitude_std \
 position_covariance_8=height_std linear.x=speed linear.y=vy_body linear.z=vz_body angular.z=yaw_rate \
 twist.covariance_0=speed_std twist.covariance_7=vy_body_std twist.covariance_14=vz_body_std \
@@ -168,7 +168,7 @@ def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str,
     ('bot', 'b', False)
     """
     parts = {topic: topic.strip("/").split("/") for topic in kinds}
-    true = {topic for topic, of in parts.items() if topic == truth or any(map(TRUTH_NAME.fullmatch, of))}
+    true = {topic for topic, of in parts.items() if topic == truth or any(map(TRUE_NAME.search, of))}
     own = {topic: of for topic, of in parts.items() if topic not in true and kinds[topic] != "range"}
     names, ranged = set[str](), {part for topic, of in parts.items() if kinds[topic] == "range" for part in of}
     for kind in {*kinds.values()}:

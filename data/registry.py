@@ -14,6 +14,7 @@ from coopoc.errors import unknown
 from coopoc.plugins import find, in_file, names
 from coopoc.world.storage import read_recording
 
+from .bag import TRUE_NAME
 from .cells import TABLES, Names
 from .fetch import bring
 from .fleet_files import read_fcd, read_table, read_tum, tum_files
@@ -218,7 +219,7 @@ def _real(path: Path, columns: Names | None = None) -> str:
         return "mrclam"
     if kind := MEASURED.get(path.suffix.lower()):
         return kind
-    return "log" if not any(path.glob("*.tum")) and is_log(path, columns) else ""
+    return "log" if all(TRUE_NAME.search(file.stem) for file in path.glob("*.tum")) and is_log(path, columns) else ""
 
 
 def _split(name_or_path: str | Path, options: dict[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:

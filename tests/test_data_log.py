@@ -102,7 +102,9 @@ def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path):
     for name, other, x in zip("ab", "ba", (0.0, 12.0), strict=True):
         seen = {f"range_{other}": 12.0, f"range_{other}_std": 0.2, "range_kept": "yes"}
         write(pd.DataFrame({"t": t, "x": 5 * t + x, "y": 0.0, "vx": 5.0, "vy": 0.0} | seen), tmp_path / f"{name}.csv")
+    co.write_tum(tmp_path / "GT_b.tum", t, np.outer(t, [5, 0, 0]))
     log = read_log(tmp_path)
+    assert log.truth.position[-1, 1, 0] == 47.5
     assert (log.recording.sensors.range_std, np.nanmax(log.recording.relative)) == pytest.approx((0.2, 12.0))
     assert sum(log.summary.unused.values()) == 40
 
@@ -111,20 +113,18 @@ def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhe
     t = arange(0, 10, 0.5)
     fixes = pd.DataFrame({"t": t, "vehicle": "car", "x": 5 * t, "y": 0.0, "std": 2.5})
     motion = pd.DataFrame({"t": t, "vehicle": "car", "vx": 5.0, "vy": 0.0})
-    (tmp_path / "log").mkdir()
-    write(fixes, tmp_path / "log" / "fixes.csv")
-    write(motion, tmp_path / "log" / "motion.csv")
-    (tmp_path / "log" / "truth.csv.gz").touch()
-    log = read_log(tmp_path / "log")
+    folder = tmp_path / "log"
+    folder.mkdir()
+    write(fixes, folder / "fixes.csv")
+    write(motion, folder / "motion.csv")
+    (folder / "truth.csv.gz").touch()
+    log = read_log(folder)
     assert log.summary.refused["files of kinds that are not read"] == (1, "truth.csv.gz")
     assert log.recording.sensors.gnss_std[:2] == pytest.approx((2.5, 2.5))
     assert any("std of fixes.csv is the standard deviation of each of x, y" in one for one in log.summary.assumed)
-    write(fixes.assign(t=t + 0.1), tmp_path / "log" / "gps.csv")
-    write(motion.assign(t=t + 0.1), tmp_path / "log" / "wheel.csv")
-    assert (
-        "one kind of car (motion.csv, wheel.csv), car (fixes.csv, gps.csv) come"
-        in f"{read_log(tmp_path / 'log').summary}"
-    )
+    write(fixes.assign(t=t + 0.1), folder / "gps.csv")
+    write(motion.assign(t=t + 0.1), folder / "wheel.csv")
+    assert "one kind of car (motion.csv, wheel.csv), car (fixes.csv, gps.csv) come" in f"{read_log(folder).summary}"
     mixed = read_log(write(fixes.assign(vx=5.0, vy=0.0, value=1.0), tmp_path / "mixed.csv"))
     assert mixed.recording.sensors.gnss_std[:2] == pytest.approx(co.Sensors().gnss_std[:2])
     unused = " ".join(map(str, mixed.summary.unused))

@@ -12,6 +12,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Floats, instance, named, one_of, texts
+from coopoc.formats.values import read_table as read_rows
 from coopoc.paths import given_path
 from coopoc.text import short_repr
 from coopoc.workers import progress_bar
@@ -30,7 +31,7 @@ from ..assemble import (
     interpolate,
     longest_gap,
 )
-from ..bag import TRUTH_NAME, read_bag
+from ..bag import TRUE_NAME, read_bag
 from ..cells import TABLES, Factors, Names, factors, headers
 from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
@@ -53,6 +54,7 @@ from .units import (
     fresh,
     in_group,
     not_vague,
+    of_kinds,
     only,
     row_of,
     stated_std,
@@ -69,11 +71,22 @@ SHORTEST_STEP, LONGEST_STEP = 0.02, 1.0
 """s, of a step that is not given."""
 FREQUENT_SHARE = 0.1
 """Share of the measurements of the most frequent kind of a vehicle, or pair, from which one counts for the step."""
+
+
+def _read_text(file: Path, summary: Summary, **_: Any) -> Rows:
+    """Rows of libRSF, else of a truth `t x y z qx qy qz qw`, whose orientation is perhaps a camera's."""
+    if is_librsf(file):
+        return read_librsf(file, summary)
+    lines, table = read_rows(file, "t x y z qx qy qz qw")
+    frame = pd.DataFrame(table[:, :4], lines, [*"txyz"])
+    return of_kinds(frame.assign(vehicle=file.stem), file.name)
+
+
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
     **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
-    ".txt": read_librsf,
+    **dict.fromkeys((".txt", ".tum"), _read_text),
     ".pt": read_nclt,
     ".pyfg": read_pyfg_rows,
 }
@@ -342,7 +355,9 @@ def _is_read(file: Path) -> bool:
     ending = file.suffix.lower()
     if ending == ".pt":
         return file.name in FILE_NAMES
-    return is_librsf(file) if ending == ".txt" and file.is_file() else ending in READERS
+    if ending in (".txt", ".tum") and file.is_file():
+        return is_librsf(file) or bool(TRUE_NAME.search(file.stem))
+    return ending in READERS
 
 
 def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> Rows:
@@ -361,7 +376,7 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
         strange = sorted(file.name for file in path.glob("[!.]*") if file.is_file() and not _is_read(file))
         summary.refuse("files of kinds that are not read", len(strange), ", ".join(strange))
-        true_by_name = [f for f in files if TRUTH_NAME.fullmatch(f.stem) and f != path]
+        true_by_name = [f for f in files if TRUE_NAME.search(f.stem) and f != path]
         true_files = true_files or true_by_name
         files = [f for f in files if f not in (*true_files, *true_by_name)]
         if not files:
@@ -404,7 +419,7 @@ def _every_file(path: Path) -> list[Path]:
 def _files(path: Path) -> list[Path]:
     """Files of a folder, and those of a folder per vehicle where it has none itself but a truth."""
     every = _every_file(path)
-    bare = not any(_is_bag(file) or (file.parent == path and not TRUTH_NAME.fullmatch(file.stem)) for file in every)
+    bare = not any(_is_bag(file) or (file.parent == path and not TRUE_NAME.search(file.stem)) for file in every)
     bare = bare and any(map(is_log, every))
     return sorted(file for file in every if bare or file.parent == path)
 
@@ -492,11 +507,14 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
 
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, summary: Summary) -> Fleet:
     """Truth of the members that have one, on the steps of the recording; a file that names none is that of the only
-    one."""
-    ids, steps, vehicles, file = recording.ids, recording.t, sorted(rows["vehicle"].unique()), rows["file"].iloc[0]
-    if len(ids) == 1 and vehicles == [Path(file).stem]:
-        rows = rows.assign(vehicle=ids[0])
-    elif not set(vehicles) & set(ids):
+    one, else of whom its name has beside the truth."""
+    ids, steps, file = recording.ids, recording.t, rows["file"].iloc[0]
+    bare = {(stem := Path(each).stem): TRUE_NAME.sub("", stem).strip("_ -") or stem for each in rows["file"].unique()}
+    if len(ids) == 1 and rows["vehicle"].isin(bare).all():
+        bare = dict.fromkeys(bare, ids[0])
+    rows = rows.replace({"vehicle": bare})
+    vehicles = sorted(rows["vehicle"].unique())
+    if not set(vehicles) & set(ids):
         raise InputError(
             f"{file}: column vehicle",
             ", ".join(vehicles),
