@@ -140,10 +140,10 @@ def read_bag(
 def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str, tuple[str, str, bool]]:
     """Topic -> the vehicle and the partner that it names, and whether it is of the truth.
 
-    Words in which topics of one kind differ name vehicles if a range has one, or most other topics of their namespace;
-    else they are sensors of one vehicle.
+    Words in which topics of one kind differ name vehicles if a range has one, or most other topics of their namespace,
+    and another kind two, unless they are of fixes; else they are sensors of one vehicle.
 
-    >>> one = {"/gps/fix": "fix", "/odom": "odometry", "/imu/data": "imu", "/ground_truth/odom": "odometry"}
+    >>> one = {"/gps/fix": "fix"} | dict.fromkeys(["/gps/odom", "/wheel/odom", "/ground_truth/odom"], "odometry")
     >>> set(_vehicles(one, "", "drive", Summary()).values()) == {("drive", "", False), ("drive", "", True)}
     True
     >>> one = {"/car/front/fix": "fix", "/car/rear/fix": "fix", "/car/imu": "imu", "/vicon/car/pose": "pose"}
@@ -175,8 +175,15 @@ def _vehicles(kinds: Names, truth: str, bag: str, summary: Summary) -> dict[str,
         alike = [of for topic, of in own.items() if kinds[topic] == kind]
         shared = os.path.commonprefix(alike)  # noqa: RUF071  (of words, not characters)
         words = {of[len(shared)] for of in alike if len(of) > len(shared) + (kind != "pose")}
-        others = [of for topic, of in own.items() if kinds[topic] != kind and of[: len(shared)] == shared]
-        if words & ranged or not others or sum(not words.isdisjoint(of) for of in others) > len(others) / 2:
+        met = [
+            (kinds[topic], words.intersection(of))
+            for topic, of in own.items()
+            if kinds[topic] != kind and of[: len(shared)] == shared
+        ]
+        named = {(other, word) for other, named in met for word in named}
+        fleet = kind == "fix" or len(named) > len(dict(named))  # another kind that names two
+        most = sum(bool(named) for _, named in met) > len(met) / 2
+        if words & ranged or (fleet and most if met else len(words) > 1):
             names |= words
     spaces = {(of[:-1] or [bag])[0] for of in own.values() if names.isdisjoint(of)}
     rest = spaces.pop() if len(spaces) == 1 else bag
