@@ -127,7 +127,7 @@ def turned(f: Filter, k: int, moved: Numbers) -> Numbers:
     return scale * east, scale * north, moved[2]
 
 
-MOST_SURE, TINY = 30.0, 1e-12
+MOST_SURE, TINY = 300.0, 1e-12
 """Times that errors of the ego's odometry change faster at most, as their squares are of their variances, since what is
 there drifts; least variance."""
 
