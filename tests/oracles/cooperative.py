@@ -969,7 +969,7 @@ class Oracle:
         x, o, f, level = b.at("x", j), b.at("o", j), eye(len(b.x)), exp(self.state.level[5])
         sure = min(
             max((b.x[o][:2] ** 2 / (diag(b.p)[o][:2] + 1e-12)).sum(), 1),
-            30 if self.priors.fix_gate and j == self.ego else 1,
+            300 if self.priors.fix_gate and j == self.ego else 1,
         )
         holds = self.life.holds ** (level**2 * sure * steps)
         f[x, o], f[o, o] = by, holds * eye(3)
