@@ -285,12 +285,12 @@ def missing_column(file: str, column: str, frame: DataFrame, allowed: str, key: 
 
 
 def _read_csv(path: Path, text: Sequence[str]) -> DataFrame:
-    separator, header, first = _first_lines(path)
+    separator, header, first, above = _first_lines(path)
     _check_header(path, header)
     if len(first) > len(header):  # the only row that pandas does not compare with the header
         raise _too_wide(path, 1, len(first), len(header))
     form: dict[str, Any] = {"sep": separator, "decimal": "." if separator == "," else ",", "names": header, "header": 0}
-    form |= {"index_col": False, "skipinitialspace": True, "encoding": "utf-8-sig"}
+    form |= {"skiprows": above, "index_col": False, "skipinitialspace": True, "encoding": "utf-8-sig"}
     if tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1):
         form["float_precision"] = "round_trip"  # the default became exact in 3.1
     form["converters"] = {name: str.strip for name in header if name.strip() in text}
@@ -299,17 +299,24 @@ def _read_csv(path: Path, text: Sequence[str]) -> DataFrame:
         return table
     except pd.errors.ParserError as error:
         wide = re.search(r"fields in line (\d+), saw (\d+)", str(error))
-        raise _too_wide(path, int(wide[1]) - 1, int(wide[2]), len(header)) if wide else error from None
+        raise _too_wide(path, int(wide[1]) - 1 - above, int(wide[2]), len(header)) if wide else error from None
 
 
-def _first_lines(path: Path) -> tuple[str, list[str], list[str]]:
-    """Separator of a CSV file, its header, and its first row."""
+def _first_lines(path: Path) -> tuple[str, list[str], list[str], int]:
+    """Separator of a CSV file, its header, its first row, and how many lines of comments, which begin with #, are above
+    the header, which may, too."""
     with path.open(encoding="utf-8-sig", newline="") as file:
-        line = file.readline(100_000)
-        separator = next((mark for mark in ",;\t" if mark in line), ",")
+        lines = [file.readline(100_000)]
+        while lines[-1].startswith("#"):
+            lines.append(file.readline(100_000))
+        separator = next((mark for mark in ",;\t" if mark in lines[-1]), ",")
+        above = len(lines) - 1
+        above -= above > 0 and 0 < lines[-2].count(separator) == lines[-1].count(separator)
         file.seek(0)
+        for _ in range(above):
+            file.readline()
         rows = csv.reader(file, skipinitialspace=True, delimiter=separator)
-        return separator, next(rows, []), next(filter(None, rows), [])
+        return separator, next(rows, []), next(filter(None, rows), []), above
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:

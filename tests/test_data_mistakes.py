@@ -323,7 +323,7 @@ def test_two_drives_of_a_file_stay_a_day_apart(tmp_path):
 
 
 def test_a_header_may_stand_in_one_of_several_tables(tmp_path):
-    (tmp_path / "whole.csv").write_text(GOOD)
+    (tmp_path / "whole.csv").write_text(f"# a, b\n{GOOD}")
     log = load_log(f"{parts(tmp_path / 'log')}?columns=vehicle:car,partner:peer&kinds=uwb:range")
     again = co.read_log(tmp_path / "log", columns={"vehicle": "car", "partner": "peer"}, kinds={"uwb": "range"})
     assert same(log.recording, again.recording)
