@@ -42,7 +42,7 @@ class GainStream:
     def step(self, gnss: ArrayLike | None, velocity: ArrayLike, dt: float, fix_age: float = 0.0) -> tuple[Floats, None]:
         """Position (3,) m, NaN before the first fix, as `FilterStream.step`; a net has no covariance.
 
-        The net gets the motion as a velocity over one second; a fix of NaN only predicts.
+        A fix of NaN only predicts.
         """
         self.history.check(gnss, velocity, dt, fix_age)
         moved = dt * np.asarray(velocity, float)
@@ -51,9 +51,10 @@ class GainStream:
         if np.isnan(self._x).all():
             self._x = self._start = fix
             return fix.copy(), None
-        near, motion = (torch.as_tensor(a[None], dtype=self._memory.x.dtype) for a in (fix - self._x, moved))
+        given = fix - self._x, np.array(velocity, float)
+        near, speed = (torch.as_tensor(a[None], dtype=self._memory.x.dtype) for a in given)
         with torch.inference_mode():
-            memory, _ = self._model.step(self._memory, near, motion, 1.0)
+            memory, _ = self._model.step(self._memory, near, speed, float(dt))
             positions = [name for name in self._model.positions if name in memory._fields]
             self._memory = memory._replace(**{name: getattr(memory, name) - memory.x for name in positions})
         self._x = self._x + memory.x[0].numpy()
@@ -93,7 +94,7 @@ class LearnedGain(Alone):
             raise InputError("model", shown(self.model), "must be a net with start and step", "Give GainNet().")
 
     def start(self, x0: ArrayLike | None = None, *, history: float = 10.0) -> GainStream:
-        """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.
+        """The net as a stream, one step at a time (docs/streaming.md).
 
         Args:
             x0: (3,) m, the exact start; None starts at the first fix.

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from math import inf, sqrt
+from math import inf, nan, sqrt
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -131,7 +131,8 @@ def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
 
 
 def errors_beside_fitted_filter(model: Gain, data: Sequence[Client]) -> tuple[float, float]:
-    """Rms errors m on validation pieces: of a model, and of a Kalman filter with noise fitted on training pieces."""
+    """Rms errors m on validation pieces: of a model, NaN where its loss is less than 0, as a likelihood's, and of a
+    Kalman filter with noise fitted on training pieces."""
     training, validation = (_joined(data, part) for part in ("training", "validation"))
     motions = training.truth.diff(dim=1) - training.dt * training.velocity[:, 1:]
     process, gnss = (
@@ -139,8 +140,8 @@ def errors_beside_fitted_filter(model: Gain, data: Sequence[Client]) -> tuple[fl
         for off in (motions, (training.gnss - training.truth) / (1.0 if training.scale is None else training.scale))
     )
     fitted = NoiseParameters().with_logs(torch.stack([process, torch.full((3,), LEAST_STD), gnss]).log())
-    ours, theirs = (sqrt(Judge([[validation]], net)(flatten([net]))) for net in (model, fitted))
-    return ours, theirs
+    ours, theirs = (Judge([[validation]], net)(flatten([net])) for net in (model, fitted))
+    return sqrt(ours) if ours >= 0.0 else nan, sqrt(theirs)
 
 
 def _in_worker(job: Job, fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:

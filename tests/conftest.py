@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy import nan, pi
+from numpy import arange, cos, nan, pi, sin
 from numpy.random import default_rng
 from scipy import stats
 
@@ -76,9 +76,9 @@ def textbook(method):
 
 def winding(steps=60, speed=8.0, period=3.0, vehicles=1):
     """Sinuous drives with x_t = x_{t-1} + dt u_t: turning at 1 / period rad/s."""
-    t = np.arange(steps) / 10
-    wave = t[:, None] / period + np.arange(vehicles)
-    velocity = speed * np.stack([np.cos(wave), np.sin(wave), 0.03 * np.cos(wave)], axis=-1)
+    t = arange(steps) / 10
+    wave = t[:, None] / period + arange(vehicles)
+    velocity = speed * np.stack([cos(wave), sin(wave), 0.03 * cos(wave)], axis=-1)
     return Fleet(tuple("abcdefgh"[:vehicles]), t, np.cumsum(0.1 * velocity, 0), velocity)
 
 
@@ -90,21 +90,21 @@ def moving(letter, t, position):
 
 def formation_fleet(vehicles=11, steps=901):
     """Rigid formation within 30 m on a gently sinuous path at 10 m/s: ten on a ring (docs/decisions.md)."""
-    t = np.arange(steps) * 0.1
-    course = 0.3 * np.sin(2 * pi * t / 60)
-    path = np.cumsum(np.c_[np.cos(course), np.sin(course), 0 * t], axis=0)
+    t = arange(steps) * 0.1
+    course = 0.3 * sin(2 * pi * t / 60)
+    path = np.cumsum(np.c_[cos(course), sin(course), 0 * t], axis=0)
     around = np.linspace(0, 2 * pi, vehicles - 1, endpoint=False)
     gap = np.linspace(22.0, 22.1, vehicles - 1)
-    offset = np.vstack([np.zeros(3), np.c_[gap * np.cos(around), gap * np.sin(around), 0 * gap]])
+    offset = np.vstack([np.zeros(3), np.c_[gap * cos(around), gap * sin(around), 0 * gap]])
     return moving("v", t, path[:, None] + offset)
 
 
 def crossing_fleet():
     """Vehicles that cross a square of 60 m at their own heights and speeds: neighbours come and go, z matters."""
-    rng, t = default_rng(3), np.arange(60) * 0.1
+    rng, t = default_rng(3), arange(60) * 0.1
     start = rng.uniform(-30, 30, (8, 3)) * [1, 1, 0.1]
     speed = rng.normal(0, 6, (8, 3)) * [1, 1, 0.05]
-    wobble = np.sin(t[:, None, None] + np.arange(8)[:, None])
+    wobble = sin(t[:, None, None] + arange(8)[:, None])
     return moving("c", t, start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1])
 
 
@@ -124,7 +124,7 @@ def coming_and_going(fleet):
 def standing(position, steps=2):
     """Vehicles that stand."""
     where = np.repeat(np.array(position, float)[None], steps, axis=0)
-    return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
+    return Fleet(tuple(f"s{i}" for i in range(len(position))), arange(steps) * 0.1, where, np.zeros_like(where))
 
 
 def with_masts(fleet, places):
@@ -150,7 +150,7 @@ def holed(recording, share=0.3, vehicles=slice(None)):
 
 def slow_fixes(recording, every=10):
     """A fix at every so many steps: at 1 Hz in data of 10 Hz."""
-    return replace(recording, gnss=np.where(np.arange(len(recording.t))[:, None, None] % every, nan, recording.gnss))
+    return replace(recording, gnss=np.where(arange(len(recording.t))[:, None, None] % every, nan, recording.gnss))
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy import arange, sin
 from numpy.random import default_rng
 
 from coopoc import V2X, Fleet, Sensors, observe
@@ -12,11 +13,11 @@ from coopoc import V2X, Fleet, Sensors, observe
 
 def drive(vehicles=4, steps=200, dt=0.1, start=0.0, gap=8.0):
     """Vehicles side by side on a wide bend at 8 m/s, `gap` metres apart."""
-    t = dt * np.arange(steps)
-    course = 0.4 * np.sin(0.15 * t)
-    step = dt * 8 * np.c_[np.cos(course), np.sin(course), 0 * t]
+    t = dt * arange(steps)
+    course = 0.4 * sin(0.15 * t)
+    step = dt * 8 * np.c_[np.cos(course), sin(course), 0 * t]
     path = np.cumsum(step, 0)
-    aside = gap * np.arange(vehicles)[:, None] * [0.2, 1.0, 0.0]
+    aside = gap * arange(vehicles)[:, None] * [0.2, 1.0, 0.0]
     position = path[:, None] + aside
     velocity = np.repeat(step[:, None] / dt, vehicles, 1)
     return Fleet(tuple(f"car{k}" for k in range(vehicles)), start + t, position, velocity)
@@ -72,14 +73,14 @@ def at(fleet, name, t):
 
 def fixes(fleet, name, every, std, seed=0):
     """Fixes x, y, z of one vehicle, in a wide table."""
-    t = np.arange(fleet.t[0], fleet.t[-1], every)
+    t = arange(fleet.t[0], fleet.t[-1], every)
     x = at(fleet, name, t) + default_rng(seed).normal(0, std, (len(t), 3))
     return pd.DataFrame({"t": t, "vehicle": name, **dict(zip("xyz", x.T, strict=True)), "x_std": std, "y_std": std})
 
 
 def motion(fleet, name, every, std, seed=0):
     """World velocities vx, vy, vz of one vehicle, in a wide table."""
-    t = np.arange(fleet.t[0], fleet.t[-1], every)
+    t = arange(fleet.t[0], fleet.t[-1], every)
     u = (at(fleet, name, t + 0.05) - at(fleet, name, t - 0.05)) / 0.1
     u += default_rng(seed).normal(0, std, u.shape)
     return pd.DataFrame({"t": t, "vehicle": name, "vx_std": std, **dict(zip(("vx", "vy", "vz"), u.T, strict=True))})
@@ -87,7 +88,7 @@ def motion(fleet, name, every, std, seed=0):
 
 def ranges(fleet, name, other, every, std, seed=0):
     """Ranges of one vehicle to another, in a wide table."""
-    t = np.arange(fleet.t[0], fleet.t[-1], every)
+    t = arange(fleet.t[0], fleet.t[-1], every)
     gap = np.linalg.norm(at(fleet, other, t) - at(fleet, name, t), axis=1)
     return noisy(default_rng(seed), t, name, {"range": (gap, std)}).assign(partner=other)
 
@@ -109,10 +110,10 @@ def star(t, rng, name, ways, velocity, seen):
 
 def bends(vehicles=2, minutes=3.0, climb=0.0):
     """Vehicles on bends through all directions at 8 m/s, 12 m apart; `climb` m of height that come and go."""
-    t = 0.02 * np.arange(int(minutes * 3000))
-    course = 2.5 * np.sin(0.1 * t)
-    velocity = np.c_[8 * np.cos(course), 8 * np.sin(course), 0.1 * climb * np.cos(0.1 * t)]
-    apart = 12.0 * np.arange(vehicles)[:, None] * [0.3, 0.9, 0.0]
+    t = 0.02 * arange(int(minutes * 3000))
+    course = 2.5 * sin(0.1 * t)
+    velocity = np.c_[8 * np.cos(course), 8 * sin(course), 0.1 * climb * np.cos(0.1 * t)]
+    apart = 12.0 * arange(vehicles)[:, None] * [0.3, 0.9, 0.0]
     position = np.cumsum(0.02 * velocity, 0)[:, None] + apart
     return Fleet(tuple(f"car{k}" for k in range(vehicles)), t, position, np.repeat(velocity[:, None], vehicles, 1))
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy import exp
 from numpy.random import default_rng
 
 KINDS: dict[str, tuple[int, float, float, float, float, float, tuple[float, ...]]] = {
@@ -38,11 +39,11 @@ def strange(folder, kind, seed=0, seconds=180.0, rate=1.0, **fault: Any):
         s, (a, b, c) = t - k * apart / pace * cars, shape[0 if cars else k]
         course[name] = 0.15 * s * robots * (-1) ** k + 1.6 * a * np.sin(0.08 * b * s + 2 * k * drones)
         speed[name] = pace * (1 + 0.3 * np.sin(0.15 * c * s))
-        path = np.cumsum(0.02 * speed[name] * np.exp(1j * course[name]))
-        path += -k * apart if cars else apart * np.exp(1.9j * k) * (k > 0)
+        path = np.cumsum(0.02 * speed[name] * exp(1j * course[name]))
+        path += -k * apart if cars else apart * exp(1.9j * k) * (k > 0)
         place[name] = np.c_[path.real, path.imag, climb * np.sin(0.1 * t + k)]
         ahead, left, up = get("tags", {}).get(name, (0, 0, 0))
-        aside = np.exp(1j * course[name]) * (ahead + 1j * left)
+        aside = exp(1j * course[name]) * (ahead + 1j * left)
         tip[name] = place[name] + np.c_[aside.real, aside.imag, 0 * t + up]
     tip |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
 
@@ -64,7 +65,7 @@ def strange(folder, kind, seed=0, seconds=180.0, rate=1.0, **fault: Any):
             add(name, fixed + late, axes, at(place[name], fixed)[:, : len(axes)], fix)
         if drones:
             u = (at(place[name], moved + 0.05) - at(place[name], moved - 0.05)) / 0.1
-            along = (u @ [1, 1j, 0]) * np.exp(-1j * body * at(course[name], moved)[:, 0])
+            along = (u @ [1, 1j, 0]) * exp(-1j * body * at(course[name], moved)[:, 0])
             u, end_of = np.c_[along.real, along.imag, u[:, 2]], "_body" * body
             add(name, moved, [f"{one}{end_of}" for one in ("vx", "vy", "vz")], scale * u, 0.1)
         else:
@@ -81,12 +82,12 @@ def strange(folder, kind, seed=0, seconds=180.0, rate=1.0, **fault: Any):
             add(name, ranged, ["range"], far / unit, reach / unit, partner=other)
             if cars:
                 side = np.arctan2(gap[:, 1:2], gap[:, :1]) - at(course[name], ranged)
-                add(name, ranged, ["bearing"], np.angle(np.exp(1j * side)), 0.02, partner=other)
+                add(name, ranged, ["bearing"], np.angle(exp(1j * side)), 0.02, partner=other)
     tables += [pd.DataFrame({"t": [1.0], "vehicle": "anchor", "x": [2.0], "y": [-1.0]})] * robots
     folder.mkdir(parents=True, exist_ok=True)
     pd.concat(tables).sort_values("t", kind="stable").to_csv(folder / "log.csv", index=False)
     for name in names:
-        heading = np.angle(np.exp(1j * course[name]))
+        heading = np.angle(exp(1j * course[name]))
         true = dict(zip(axes, place[name].T, strict=False))
         tables.append(pd.DataFrame({"t": t, "vehicle": name, **true, "heading": heading})[::5])
     pd.concat(tables[-count:]).to_csv(folder / "truth.csv", index=False)

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from conftest import coming_and_going, half_width, refused, standing, textbook, without
+from numpy import isfinite
 from oracles.batch_smoother import batch_smoother
 from scipy.optimize import least_squares
 
@@ -52,7 +53,7 @@ def compare(known, recording):
     """Positions and covariances of all vehicles that are there throughout, in every run."""
     model = KNOWN[known]
     noise = resolve(model, recording)
-    there = np.isfinite(recording.velocity).all(axis=(0, 1, 3)) & np.isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
+    there = isfinite(recording.velocity).all(axis=(0, 1, 3)) & isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
     egos = np.flatnonzero(there).tolist()
     track = textbook(BatchSmoother(model))(recording, egos)
     for run in range(recording.runs):
@@ -66,8 +67,8 @@ def compare(known, recording):
 
 def held(gnss):
     """Each vehicle's last fix, its first one before that."""
-    t = np.maximum.accumulate(np.where(np.isfinite(gnss[..., 0]), np.arange(len(gnss))[:, None], -1))
-    return gnss[np.where(t < 0, np.isfinite(gnss[..., 0]).argmax(0), t), np.arange(gnss.shape[1])]
+    t = np.maximum.accumulate(np.where(isfinite(gnss[..., 0]), np.arange(len(gnss))[:, None], -1))
+    return gnss[np.where(t < 0, isfinite(gnss[..., 0]).argmax(0), t), np.arange(gnss.shape[1])]
 
 
 @pytest.mark.parametrize("channel", CHANNELS)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import refused, with_masts
+from numpy import array_equal
 
 import coopoc as co
 from coopoc.world.body_frames import body_motion, in_world, true_heading
@@ -22,8 +23,8 @@ def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing, body):
     """Closed form: a bearing plus the compass is the azimuth, with the same errors; fixes and ranges are equal."""
     world = co.observe(crossing, NOISE, co.V2X(max_neighbours=3), runs=3)
     again = in_world(body)
-    assert np.array_equal(again.gnss, world.gnss)
-    assert np.array_equal(again.relative[..., [0, 2]], world.relative[..., [0, 2]])
+    assert array_equal(again.gnss, world.gnss)
+    assert array_equal(again.relative[..., [0, 2]], world.relative[..., [0, 2]])
     assert abs(np.angle(np.exp(1j * (again.relative[..., 1] - world.relative[..., 1])))).max() < 1e-12
 
 
@@ -44,8 +45,8 @@ def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(
         co.observe(crossing, co.Sensors(**more), runs=400, frame="body")
         for more in ({}, {"yaw_rate_bias_std": 0.05, "speed_scale_std": 0.1})
     )
-    assert np.array_equal(plain.gnss, biased.gnss)
-    assert np.array_equal(plain.body.heading, biased.body.heading)
+    assert array_equal(plain.gnss, biased.gnss)
+    assert array_equal(plain.body.heading, biased.body.heading)
     bias = biased.body.yaw_rate - plain.body.yaw_rate
     assert np.ptp(bias, axis=1).max() < 1e-2  # one for a whole run
     assert bias[:, 0].std() == pytest.approx(0.05, rel=0.1)
@@ -65,7 +66,7 @@ def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing
     assert of_mast.any()
     assert not (seen.links.observer == 8).any()
     assert (seen.arrival[:, of_mast] == -1).all()
-    assert np.array_equal(seen.relative[:, ~of_mast], alone.relative)  # neighbours and their draws are as without it
+    assert array_equal(seen.relative[:, ~of_mast], alone.relative)  # neighbours and their draws are as without it
     with refused("landmarks"):
         co.observe(crossing, co.Sensors(), landmarks=["c0"])
 
@@ -85,9 +86,9 @@ def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body, tmp_path):
     body = replace(body, tags=np.eye(8, 3))
     save_recording(body, tmp_path / "body.npz")
     again, _ = read_recording(tmp_path / "body.npz")
-    assert np.array_equal(again.body.yaw_rate, body.body.yaw_rate)
-    assert np.array_equal(again.tags, body.tags)
-    assert np.array_equal(body.between(10, 20).of_runs(slice(1, 3)).body.heading, body.body.heading[1:3, 10:20])
+    assert array_equal(again.body.yaw_rate, body.body.yaw_rate)
+    assert array_equal(again.tags, body.tags)
+    assert array_equal(body.between(10, 20).of_runs(slice(1, 3)).body.heading, body.body.heading[1:3, 10:20])
 
 
 def test_who_has_no_heading_notes_tags(body):

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from numpy import pi
+from numpy import arange, hypot, isnan, pi
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from shell import ran
@@ -22,7 +22,7 @@ from coopoc.data.registry import read_log as load_log
 from coopoc.evaluate.metrics import innovation_columns
 from coopoc.studies import real
 
-T = np.round(np.arange(0, 40, 0.1), 1)
+T = np.round(arange(0, 40, 0.1), 1)
 CARS = {"red": (0.0, 12.0, 0.10), "blue": (1.0, 16.0, 0.08), "green": (2.5, 20.0, 0.09)}
 MAST = (25.0, 3.0)
 STD = {"speed": 0.05, "yaw_rate": 0.01, "x": 0.5, "y": 0.5, "range": 0.1, "bearing": 0.03, "heading": 0.05}
@@ -64,8 +64,8 @@ def table(noise=0.0, mirrored=False, compass=True):
                         apart = cars[other][0][i] - place[i]
                         turned = wrapped(np.arctan2(apart[1], apart[0]) - heading[i])
                         add(t, name, "bearing", -turned if mirrored else turned, other)
-                        add(t, name, "range", np.hypot(*apart), other)
-                add(t, "mast", "range", np.hypot(*(place[i] - MAST)), name)
+                        add(t, name, "range", hypot(*apart), other)
+                add(t, "mast", "range", hypot(*(place[i] - MAST)), name)
     rows += [(0.0, "mast", "x", "", MAST[0], 0.01), (0.0, "mast", "y", "", MAST[1], 0.01)]
     log = pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value", "std"])
     return log, pd.DataFrame(truth, columns=["t", "vehicle", "x", "y", "heading"])
@@ -90,18 +90,18 @@ def test_what_was_measured_is_what_the_recording_holds(tmp_path):
         assert_allclose(rec.velocity[0, :, k], np.tile([speed, 0, 0], (len(T), 1)), atol=1e-12)
         assert_allclose(rec.body.yaw_rate[0, :, k], rate, atol=1e-12)
         assert_allclose(rec.gnss[0, ::10, k, :2], place[::10], atol=1e-12)
-        assert np.isnan(rec.gnss[0, 1:10, k]).all()
+        assert isnan(rec.gnss[0, 1:10, k]).all()
         assert_allclose(wrapped(rec.body.heading[0, ::5, k] - heading[::5]), 0, atol=1e-12)
-        assert np.isnan(rec.body.heading[0, 1:5, k]).all()
+        assert isnan(rec.body.heading[0, 1:5, k]).all()
     for step, observer, neighbour, relative in zip(
         rec.links.step, rec.links.observer, rec.links.neighbour, rec.relative[0], strict=True
     ):
         place, heading = cars[rec.ids[observer]][:2]
         other = np.array(MAST) if neighbour == mast else cars[rec.ids[neighbour]][0][step]
         apart = other - place[step]
-        assert relative[0] == pytest.approx(np.hypot(*apart))
+        assert relative[0] == pytest.approx(hypot(*apart))
         if neighbour == mast:  # it measured the range, which a filter needs from the vehicle
-            assert np.isnan(relative[1])
+            assert isnan(relative[1])
         else:
             assert wrapped(relative[1] - np.arctan2(apart[1], apart[0]) + heading[step]) == pytest.approx(0, abs=1e-9)
     assert (rec.links.observer != mast).all()
@@ -118,7 +118,7 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path):
     begin, cars = co.pose_start(log.recording)[0], drives()
     for name, (place, heading, _, _) in cars.items():
         found = begin[log.recording.ids.index(name)]
-        assert np.hypot(*(found[:2] - place[0])) < 2.5
+        assert hypot(*(found[:2] - place[0])) < 2.5
         assert abs(wrapped(found[3] - heading[0])) < np.deg2rad(20)
     track = co.PoseFilter("fleet", begin=begin[None])(log.recording, list(CARS))
     assert np.nanmean(co.pose_nees(track, log.truth)[:, 100:]) < 6
@@ -137,7 +137,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
     pd.concat([frame, pd.DataFrame(more, columns=frame.columns)]).to_csv(tmp_path / "log.csv")
     log = co.read_log(tmp_path / "log.csv", frame="body")
     columns = [log.recording.ids.index(name) for name in CARS]
-    assert np.isnan(log.recording.gnss[:, :, columns]).all()
+    assert isnan(log.recording.gnss[:, :, columns]).all()
     assert log.summary.refused["messages of landmarks, and their measurements other than ranges to vehicles"][0] == 1
     assert log.summary.refused["world velocities in body frames"][0] == 1
     begin = np.full((4, 4), np.nan)
@@ -273,7 +273,7 @@ def test_studies_say_where_a_log_belongs(tmp_path):
 
 def librsf(folder, wheels):
     """A robot on a circle of 5 m ranges four anchors without error, as libRSF writes it; its true way and headings."""
-    t = np.arange(0, 40, 0.1)
+    t = arange(0, 40, 0.1)
     angle = 0.15 * t
     place = 5 * np.c_[np.cos(angle), np.sin(angle)]
     measured, true = [], []
@@ -316,7 +316,7 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path, wheels):
 
 def test_ranges_are_moved_to_their_step(tmp_path):
     """Closed form: cars that pass each other at 30 m/s range 0.04 s after a step."""
-    t = np.arange(90) / 10
+    t = arange(90) / 10
     x, cars = 15 * t - 60, [pd.DataFrame({"t": t + 0.04, "vehicle": "a", "partner": "b", "range": 118.8 - 30 * t})]
     for name, way in (("a", 1), ("b", -1)):
         own = {"vehicle": name, "speed": 15, "yaw_rate": 0, "x": way * x, "y": 0, "heading": np.arccos(way)}
@@ -328,7 +328,7 @@ def test_ranges_are_moved_to_their_step(tmp_path):
 
 def test_ranges_and_bearings_are_moved_to_their_step_without_a_place(tmp_path):
     """Closed form: on a circle of 30 m at 12 m/s, what a car measures of a mast 0.05 s after a step."""
-    t, turn = np.arange(90) / 10, 0.4j
+    t, turn = arange(90) / 10, 0.4j
     mast, mean = 50 + 9j, np.sinc(0.02 / pi)  # speeds are that of a chord
     at = [(mast + 30j * np.exp(turn * when)) * np.exp(-turn * when) for when in (t, t + 0.05)]
     seen = pd.DataFrame({"t": t + 0.05, "partner": "mast", "range": abs(at[1]), "bearing": np.angle(at[1])})

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from logs import noisy, star
+from numpy import arange, exp, sin
 from numpy.random import default_rng
 from strange_logs import strange
 
@@ -182,9 +183,9 @@ PLACES = pd.DataFrame({"vehicle": [*"abcde"], "x": [-20.0, 20, 20, -20, 0], "y":
 @pytest.mark.parametrize("wrong", [0, 1])
 def test_anchors_elsewhere_are_named_and_no_scale_is(tmp_path, wrong):
     """Walkers with a fix each: dead reckoning that drifts was ranges that are too long."""
-    rng, t, tables, truth = default_rng(5), np.arange(0, 150, 0.2), list[pd.DataFrame](), list[pd.DataFrame]()
+    rng, t, tables, truth = default_rng(5), arange(0, 150, 0.2), list[pd.DataFrame](), list[pd.DataFrame]()
     for k, name in enumerate("uvw"):
-        u = (1 + 0.3 * np.sin(0.3 * t)) * np.exp(1j * (0.07 * t + 2 * k))
+        u = (1 + 0.3 * sin(0.3 * t)) * exp(1j * (0.07 * t + 2 * k))
         x = 5j * k + 0.2 * np.cumsum(u) - 0.1 * u
         true = {"x": (x.real, 0.5), "y": (x.imag, 0.5)}
         seen = {
@@ -210,8 +211,8 @@ def test_understated_ranges_are_named_without_a_truth(tmp_path):
 
 def test_a_hundred_anchors_are_read_without_a_word(tmp_path):
     """pandas warned of frames with more than a hundred columns, once for each of them."""
-    rng, t = default_rng(2), np.arange(0, 40, 0.5)
-    x, places = 10 * np.exp(0.1j * t), 20 * rng.uniform(-1, 1, (2, 110))
+    rng, t = default_rng(2), arange(0, 40, 0.5)
+    x, places = 10 * exp(0.1j * t), 20 * rng.uniform(-1, 1, (2, 110))
     ranges = abs(x[:, None] - places[0] - 1j * places[1]) + rng.normal(0, 0.01, (len(t), 110)) + 0.05
     table = {"x": x.real, "y": x.imag} | {f"range_m{k}": each for k, each in enumerate(ranges.T)}
     pd.DataFrame({"t": t, "vehicle": "a", **table}).to_csv(tmp_path / "log.csv")
@@ -234,11 +235,11 @@ def test_a_receiver_that_loses_its_base_is_named(tmp_path):
 
 @pytest.mark.parametrize(
     ("pace", "factor", "words"),
-    [(1.2, np.exp(0.1j), "turned by [56]"), (9.0, 1.04, "too fast by [34]"), (9.0, 0.96, "too slow by [34]")],
+    [(1.2, exp(0.1j), "turned by [56]"), (9.0, 1.04, "too fast by [34]"), (9.0, 0.96, "too slow by [34]")],
 )
 def test_odometry_of_one_that_errs_is_no_clock_of_others(tmp_path, pace, factor, words):
-    rng, t, k = default_rng(5), np.arange(0, 150, 0.2), np.arange(4)[:, None]
-    u = pace * (1 + 0.25 * np.sin(0.08 * t + k)) * np.exp(1.2j * np.sin(0.07 * t + 0.3 * k))
+    rng, t, k = default_rng(5), arange(0, 150, 0.2), arange(4)[:, None]
+    u = pace * (1 + 0.25 * sin(0.08 * t + k)) * exp(1.2j * sin(0.07 * t + 0.3 * k))
     x = 0.2 * np.cumsum(u, 1) - 0.1 * u + 9j * k
     u[1] *= factor
     ways = dict(zip("abcd", x, strict=True))
@@ -280,10 +281,10 @@ def test_odometry_that_fails_in_a_part_is_no_fault_of_others(tmp_path, fault, wo
 )
 def test_errors_that_last_are_no_fault_and_small_lags_are(tmp_path, fault, words):
     """Errors that last 30 s on a straight road were an offset of radios; 0.3 s were no lag."""
-    rng, t, tables = default_rng(1), np.arange(0, 300, 0.5), list[pd.DataFrame]()
-    wanders, swing = fault == "receivers wander", 0.1 * np.sin(0.06 * t)
-    u = 20 * np.exp(1j * (swing if wanders else 12 * swing)) * (1 + swing)
-    memory = np.exp(-np.arange(200) / 60)
+    rng, t, tables = default_rng(1), arange(0, 300, 0.5), list[pd.DataFrame]()
+    wanders, swing = fault == "receivers wander", 0.1 * sin(0.06 * t)
+    u = 20 * exp(1j * (swing if wanders else 12 * swing)) * (1 + swing)
+    memory = exp(-arange(200) / 60)
     x = {name: 0.5 * np.cumsum(u) - 0.25 * u - 30 * k for k, name in enumerate("abc")}
     for name, way in x.items():
         late = 0.3 * (name == "b" and not wanders)

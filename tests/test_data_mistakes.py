@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from numpy import arange
 from shell import ROOT
 from strange_logs import strange
 
@@ -268,7 +269,7 @@ def test_a_named_index_is_a_column_and_none_is_behind_the_last_comma(tmp_path, n
 
 def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
     """The long table without a word is the reference; names are whole numbers that pandas has written as floats."""
-    t, made = np.arange(0, 20, 0.5), {"wide": [], "long": []}
+    t, made = arange(0, 20, 0.5), {"wide": [], "long": []}
     names, at = ["1.0", "2.0", "007"], np.array([[0.0, 0.0], [0.0, 9.0], [12.0, 0.0]])
     for now in t.tolist():
         for k, name in enumerate(names):
@@ -292,7 +293,7 @@ def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
 def test_clocks_that_begin_anew_go_on(tmp_path, period):
     """The end of summer time, seconds of the day at midnight, of the GPS week at its end, milliseconds of 32 bits,
     weeks of ten: the file with stamps that go on is the reference. One vehicle comes after the turn."""
-    t, rows = period - 10 + np.arange(0, 20, 0.5), []
+    t, rows = period - 10 + arange(0, 20, 0.5), []
     for now in t.tolist():
         at = {"t": now, "x": 8 * (now - period), "vx": 8.0, "vy": 0.0}
         rows += [{**at, "vehicle": "a", "y": 0.0}, *[{**at, "vehicle": "b", "y": 5.0}] * (now > period + 2)]
@@ -317,7 +318,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path, period):
 
 
 def test_two_drives_of_a_file_stay_a_day_apart(tmp_path):
-    drive = pd.DataFrame({"t": np.arange(20.0), "x": np.arange(20.0), "y": 0.0, "vx": 1.0, "vy": 0.0})
+    drive = pd.DataFrame({"t": arange(20.0), "x": arange(20.0), "y": 0.0, "vx": 1.0, "vy": 0.0})
     pd.concat([drive, drive.assign(t=drive["t"] + 86400)]).to_csv(tmp_path / "a.csv")
     assert np.isfinite(co.read_log(tmp_path / "a.csv").recording.gnss[0, :, 0, 0]).sum() == 40
 
@@ -412,7 +413,7 @@ def test_places_need_no_times(tmp_path):
 )
 def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
     """Every fourth row: the log is that with empty cells; one alone, or a mast at the origin, is what it says."""
-    t = np.arange(0.0, 12.0, 0.2)
+    t = arange(0.0, 12.0, 0.2)
     car = pd.DataFrame({"t": t, "vehicle": "car", "x": 5e3 + 8 * t, "y": 300.0, "speed": 8.0, "heading": 0.01 * t})
     car = car.assign(partner="mast", range=np.hypot(car["x"], 300.0 + 10 * np.sin(t)))
     for name, rows, cell in (("a", slice(3, None, 4), code), ("b", slice(3, None, 4), np.nan), ("one", [3], code)):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import measured, refused
+from numpy import loadtxt
 from numpy.linalg import norm
 from scipy.linalg import lstsq
 
@@ -40,13 +41,13 @@ def seen(log, known):
 def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen):
     """Counted from the raw text: steps, robots and subjects that were measured, and what was measured there."""
     folder = measured(SET)
-    barcodes = {int(a[1]): int(a[0]) for a in np.loadtxt(folder / "Barcodes.dat")}
+    barcodes = {int(a[1]): int(a[0]) for a in loadtxt(folder / "Barcodes.dat")}
     start = max(
-        np.loadtxt(folder / f"Robot{n}_{what}.dat")[0, 0] for n in range(1, 6) for what in ("Groundtruth", "Odometry")
+        loadtxt(folder / f"Robot{n}_{what}.dat")[0, 0] for n in range(1, 6) for what in ("Groundtruth", "Odometry")
     )
     wanted: dict[tuple[int, int, int], list[tuple[float, float]]] = {}
     for robot in range(1, 6):
-        for t, code, reach, bearing in np.loadtxt(folder / f"Robot{robot}_Measurement.dat"):
+        for t, code, reach, bearing in loadtxt(folder / f"Robot{robot}_Measurement.dat"):
             subject, step = barcodes.get(int(code), 0), round((t - start) / 0.1)
             if subject and 0 <= step < len(seen.t):
                 wanted.setdefault((step, robot - 1, subject - 1), []).append((reach, bearing))
@@ -118,13 +119,13 @@ def other_set(tmp_path_factory):
     source, folder = measured(SET), tmp_path_factory.mktemp("sets") / "MRCLAM_Dataset0"
     folder.mkdir()
     order = {3: 1, 1: 2, 5: 3, 2: 4}
-    start = np.loadtxt(source / "Robot1_Groundtruth.dat")[0, 0] + 100
+    start = loadtxt(source / "Robot1_Groundtruth.dat")[0, 0] + 100
     for old, new in order.items():
         for what in ("Groundtruth", "Odometry", "Measurement"):
             lines = (source / f"Robot{old}_{what}.dat").read_text().splitlines()
             kept = [x for x in lines if x.startswith("#") or start <= float(x.split()[0]) < start + 500]
             (folder / f"Robot{new}_{what}.dat").write_text("\n".join(kept) + "\n")
-    rows = np.loadtxt(source / "Barcodes.dat").astype(int)
+    rows = loadtxt(source / "Barcodes.dat").astype(int)
     renamed = [(order.get(subject, subject), code) for subject, code in rows.tolist() if subject != 4]
     (folder / "Barcodes.dat").write_text("\n".join(f"{subject} {code}" for subject, code in renamed) + "\n")
     shutil.copy(source / "Landmark_Groundtruth.dat", folder)

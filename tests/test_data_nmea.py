@@ -15,6 +15,7 @@ import pytest
 from conftest import measured, refused
 from fuzz.good_files import sentence
 from logs import drive
+from numpy import array
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -125,7 +126,7 @@ def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d():
     lines = measured("AV_veh1.nmea").read_bytes().splitlines()[:100]
     parsed = [pynmeagps.NMEAReader.parse(line + b"\r\n") for line in lines]
     assert log.origin is not None
-    at = np.array([(m.lat, m.lon, float(m.alt) + float(m.sep)) for m in parsed])
+    at = array([(m.lat, m.lon, float(m.alt) + float(m.sep)) for m in parsed])
     assert_allclose(at[0], log.origin)
     assert_allclose(
         log.recording.gnss[0, :100, 0], np.column_stack(pymap3d.geodetic2enu(*at.T, *log.origin)), atol=1e-5
@@ -196,15 +197,15 @@ def test_motion_capture_and_radios_of_a_public_bag():
             at = m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
             where = m.pose.position if "pose" in c.topic else None
             raw.setdefault(c.topic, []).append((at, m.range) if where is None else (at, where.x, where.y, where.z))
-    way = {name: np.array(raw[f"/vrpn_client_node/{name}/pose"]) for name in recording.ids}
+    way = {name: array(raw[f"/vrpn_client_node/{name}/pose"]) for name in recording.ids}
     one = way["turtlebot1"]
     k = recording.ids.index("turtlebot1")
-    near = np.array([abs(one[:, 1:] - fix).sum(1).min() for fix in recording.gnss[0, 100:200, k]])
+    near = array([abs(one[:, 1:] - fix).sum(1).min() for fix in recording.gnss[0, 100:200, k]])
     assert np.nanmax(near) < 1e-5  # a fix is brought to its step
     errors = []
     for topic, rows in raw.items():
         if "distance" in topic and "n_8" not in topic:
-            t, ranges = np.array(rows).T
+            t, ranges = array(rows).T
             a, b = (way[f"turtlebot{part[2:]}"] for part in topic.split("/")[3:5])
             gap = [np.interp(t, a[:, 0], a[:, d]) - np.interp(t, b[:, 0], b[:, d]) for d in (1, 2, 3)]
             errors.append(ranges - norm(gap, axis=0))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import refused
 from filterpy.kalman import KalmanFilter
+from numpy import array, diag
 from scipy.linalg import solve_discrete_are
 
 from coopoc import V2X, Fleet, Sensors, bound_rt_le, load_fleet, nees, observe, posterior_bound, rt_le
@@ -56,12 +57,12 @@ def test_alone_it_is_filterpys_augmented_filter():
     q = NoiseModel.nominal(BOTH).process_variance(seen)[0, :, 0]
     for axis in range(3):
         kf = KalmanFilter(dim_x=3, dim_z=1)
-        kf.x, kf.P = np.array([[seen.gnss[0, 0, 0, axis]], [0.0], [0.0]]), np.diag([1e6, 4.0, 1.0])
-        kf.H, kf.R = np.ones((1, 3)), np.array([[1.5**2]])
-        kf.F, kf.B = np.diag([1.0, keep, keep]), np.array([[0.1], [0.0], [0.0]])
+        kf.x, kf.P = array([[seen.gnss[0, 0, 0, axis]], [0.0], [0.0]]), diag([1e6, 4.0, 1.0])
+        kf.H, kf.R = np.ones((1, 3)), array([[1.5**2]])
+        kf.F, kf.B = diag([1.0, keep, keep]), array([[0.1], [0.0], [0.0]])
         for t in range(len(fleet.t)):
             if t:
-                kf.predict(u=seen.velocity[0, t, 0, axis], Q=np.diag([q[t, axis], 4 * (1 - keep**2), 1 - keep**2]))
+                kf.predict(u=seen.velocity[0, t, 0, axis], Q=diag([q[t, axis], 4 * (1 - keep**2), 1 - keep**2]))
             kf.update(seen.gnss[0, t, 0, axis])
             assert track.x[0, t, 0, axis] == pytest.approx(kf.x[0, 0], abs=1e-5)
             assert track.covariance[0, t, 0, axis, axis] == pytest.approx(kf.P[0, 0], rel=1e-4)
@@ -71,8 +72,8 @@ def test_bound_of_a_single_vehicle_is_the_riccati_equations():
     """SciPy's solve_discrete_are of (x, drift) per axis, after many steps at constant velocity."""
     fleet, keep = convoy(1, steps=3000), np.exp(-0.1 / 5.0)
     found = posterior_bound(fleet, OWN, 0)[-1, 0, 0]
-    process = np.diag([(0.1 * OWN.velocity_std_ratio * 10.0) ** 2, 4 * (1 - keep**2)])
-    prior = solve_discrete_are(np.diag([1.0, keep]).T, np.ones((2, 1)), process, np.array([[1.5**2]]))
+    process = diag([(0.1 * OWN.velocity_std_ratio * 10.0) ** 2, 4 * (1 - keep**2)])
+    prior = solve_discrete_are(diag([1.0, keep]).T, np.ones((2, 1)), process, array([[1.5**2]]))
     assert found == pytest.approx(
         (prior - np.outer(prior.sum(1) / (prior.sum() + 1.5**2), prior.sum(0)))[0, 0], rel=1e-3
     )

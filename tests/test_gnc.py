@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from conftest import refused
+from numpy import array
 from numpy.random import default_rng
 from random_graphs import PAIR, torn
 from scipy.optimize import minimize_scalar
@@ -28,7 +29,7 @@ def paper_rho(r, mu):
 def test_weights_are_those_of_the_surrogate(mu):
     """w = d rho_mu / d r^2, and the minimiser of w r^2 + Phi_mu(w), whose minimum is rho_mu (Black and Rangarajan)."""
     for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
-        weight = float(graduated.weights(np.array(r**2), mu))
+        weight = float(graduated.weights(array(r**2), mu))
         assert weight == pytest.approx(
             (paper_rho(np.sqrt(r**2 + 1e-7), mu) - paper_rho(np.sqrt(r**2 - 1e-7), mu)) / 2e-7, abs=1e-6
         )
@@ -48,7 +49,7 @@ def test_of_all_subsets_it_finds_the_best():
         z[: seed % 5] += rng.uniform(-40, 40, (seed % 5, 3))
         problem = Problem([*"a"]).add("position", ["a"], [[0, 0, 0]], std=3.0).add("position", ["a"] * 9, z, std=1.0)
         bound = chi2.ppf(0.99, 3)
-        chosen = np.array(list(itertools.product([0.0, 1.0], repeat=9)))
+        chosen = array(list(itertools.product([0.0, 1.0], repeat=9)))
         x = chosen @ z / (chosen.sum(axis=1, keepdims=True) + 1 / 9)
         square = np.minimum(((z - x[:, None]) ** 2).sum(2), bound).sum(1) + (x**2).sum(1) / 9
         best = 0.5 * square.min()
@@ -73,7 +74,7 @@ def test_a_group_is_one_hypothesis():
 def test_wrong_loop_closures_are_those_that_gtsam_finds():
     """Poses in the plane, against BetweenFactorPose2 under GncLMOptimizer."""
     rng = default_rng(4)
-    turn, std = [0, 0, 0, np.pi / 2] * 5, np.array([0.1, 0.1, 0.02])
+    turn, std = [0, 0, 0, np.pi / 2] * 5, array([0.1, 0.1, 0.02])
     steps = (gtsam.Pose2(2.0, 0, angle) for angle in turn)
     poses = [*itertools.accumulate(steps, gtsam.Pose2.compose, initial=gtsam.Pose2())]
     noisy = lambda p: p.compose(gtsam.Pose2(*rng.normal(0, std)))  # noqa: E731
@@ -102,7 +103,7 @@ def test_wrong_loop_closures_are_those_that_gtsam_finds():
     ours = solve_gnc(problem, [(1, range(20, 27))])
     assert np.array_equal(ours.extras["weights"], optimiser.getWeights()[-7:])
     assert np.array_equal(ours.extras["weights"], [1, 1, 1, 1, 0, 0, 0])
-    assert ours.position == pytest.approx(np.array([theirs.atPose2(k).translation() for k in range(21)]), abs=1e-4)
+    assert ours.position == pytest.approx(array([theirs.atPose2(k).translation() for k in range(21)]), abs=1e-4)
 
 
 LOST = PAIR.add("range", ("a", "b"), 1.0, std=1.0, loss=Loss("huber", 1.0))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from numpy import array
 from numpy.testing import assert_allclose
 
 import coopoc as co
@@ -39,19 +40,19 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale, priors):
     seen = replace(seen, velocity=seen.velocity * (1 + scale))
     track = CooperativeFilter(priors=priors)(seen, [0])
     process = co.NoiseModel.nominal(S2).process_variance(seen)[0, :, 0, 0]
-    filters, likely = [], np.array([ONLY_SCALE.absent, 0.0])
+    filters, likely = [], array([ONLY_SCALE.absent, 0.0])
     for n in (1, 2):
         peer = KalmanFilter(dim_x=n, dim_z=1)
-        peer.x, peer.P = np.array([[seen.gnss[0, 0, 0, 0]], [0.0]])[:n], np.diag([12.25, 0.01])[:n, :n]
-        peer.H, peer.R = np.eye(1, n), np.array([[12.25]])
+        peer.x, peer.P = array([[seen.gnss[0, 0, 0, 0]], [0.0]])[:n], np.diag([12.25, 0.01])[:n, :n]
+        peer.H, peer.R = np.eye(1, n), array([[12.25]])
         filters.append(peer)
     for k in range(1, len(t)):
         moved = 0.5 * seen.velocity[0, k, 0, 0]
         for i, peer in enumerate(filters):
-            peer.F = np.array([[1.0, moved], [0.0, 1.0]])[: i + 1, : i + 1]
+            peer.F = array([[1.0, moved], [0.0, 1.0]])[: i + 1, : i + 1]
             peer.predict(Q=np.diag([process[k], 0.0])[: i + 1, : i + 1])
             peer.x[0] += moved
-            peer.update(np.array([[seen.gnss[0, k, 0, 0]]]))
+            peer.update(array([[seen.gnss[0, k, 0, 0]]]))
             likely[i] += peer.log_likelihood
         there = 1.0 / (1.0 + np.exp(likely[0] - likely[1]))
         assert_allclose(track.x[0, k, 0, 0], (1 - there) * filters[0].x[0, 0] + there * filters[1].x[0, 0], atol=2e-3)
@@ -97,7 +98,7 @@ def test_a_slip_is_found_and_ends(town):
 def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town, factor, said):
     """Real fixes are assumed to err more than is stated; a note says by how much they do."""
     sensors = replace(S2, range_offset_std=0.3)
-    acts = replace(sensors, gnss_std=tuple(factor * np.array(S2.gnss_std)))
+    acts = replace(sensors, gnss_std=tuple(factor * array(S2.gnss_std)))
     seen = observe(town, acts, V2X(4), runs=2, observers=[3], assumed=sensors)
     notes = CooperativeFilter()(replace(seen, notes=(NOTHING_SIMULATED,)), [3]).notes
     levels = [float(note.split()[-5]) for note in notes if note.startswith(f"fix level, {town.ids[3]}: ")]

@@ -2,6 +2,7 @@
 
 import numpy as np
 from conftest import refused
+from numpy import zeros
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -15,7 +16,7 @@ def track():
     shape = 2, 4, 2
     root = rng.normal(size=(*shape, 3, 3))
     heading = rng.uniform(-3, 3, shape)
-    none = np.zeros((2, 2))
+    none = zeros((2, 2))
     return co.Track(
         t=np.arange(4) * 0.1,
         egos=(2, 0),
@@ -88,12 +89,12 @@ def test_a_path_that_no_program_could_read_is_refused(tmp_path):
     gap = [[0.0, 0, 0], [np.nan, 0, 0]]
     for write, named in (
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], gap), r"position\[1"),
-        (lambda: co.write_tum(tmp_path / "a", [0.1, 0.1], np.zeros((2, 3))), r"t\[1\] = 0.1"),
-        (lambda: co.write_tum(tmp_path / "a", [0.0], np.zeros((2, 3))), "t = shape"),
-        (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 2))), "position"),
-        (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 3)), [0.0]), "heading"),
-        (lambda: co.write_tum("", [0.0, 0.1], np.zeros((2, 3))), "path"),
-        (lambda: co.write_tum(tmp_path, [0.0, 0.1], np.zeros((2, 3))), "must be a file, and is a folder"),
+        (lambda: co.write_tum(tmp_path / "a", [0.1, 0.1], zeros((2, 3))), r"t\[1\] = 0.1"),
+        (lambda: co.write_tum(tmp_path / "a", [0.0], zeros((2, 3))), "t = shape"),
+        (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], zeros((2, 2))), "position"),
+        (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], zeros((2, 3)), [0.0]), "heading"),
+        (lambda: co.write_tum("", [0.0, 0.1], zeros((2, 3))), "path"),
+        (lambda: co.write_tum(tmp_path, [0.0, 0.1], zeros((2, 3))), "must be a file, and is a folder"),
     ):
         with refused(named):
             write()

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy import arange
 from numpy.testing import assert_allclose
 from oracles.pace import heard
 from oracles.solo import filterpys
@@ -24,10 +25,10 @@ estimate forward. A smoother sees the road from both sides."""
 @cache
 def road(vehicles=3, steps=60):
     """A straight road eastward, in steps of 1 s, and noise that is white and known."""
-    t = np.arange(float(steps))
+    t = arange(float(steps))
     x, u = np.zeros((2, steps, vehicles, 3))
-    u[..., 0], x[..., 1] = SPEED, 5.0 * np.arange(vehicles)
-    x[..., 0] = SPEED * t[:, None] + 20.0 * np.arange(vehicles)
+    u[..., 0], x[..., 1] = SPEED, 5.0 * arange(vehicles)
+    x[..., 0] = SPEED * t[:, None] + 20.0 * arange(vehicles)
     fleet = Fleet(tuple("abcdef"[:vehicles]), t, x, u)
     return fleet, observe(fleet, NOISY, V2X(vehicles), runs=RUNS, seed=1)
 
@@ -77,7 +78,7 @@ def test_the_pace_of_a_step_does_not_know_its_velocity():
     gained = after - before
     assert not gained[:11].any()
     assert 0 < gained[11] < 3 * before[10] + (0.15 * 10.0) ** 2
-    assert_allclose(gained[12:16] / gained[11], 3.0 ** -np.arange(1, 5), rtol=1e-9)
+    assert_allclose(gained[12:16] / gained[11], 3.0 ** -arange(1, 5), rtol=1e-9)
 
 
 def test_it_is_filterpys_filter_with_the_noise_of_the_pace():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import textbook
 from logs import NOISE, drive
-from numpy import nan
+from numpy import arange, nan
 from numpy.linalg import eigvalsh, norm
 from numpy.random import default_rng
 
@@ -19,9 +19,9 @@ COOPERATIVE = [name for name, make in METHODS.items() if make("nominal").coopera
 
 def in_line(count, gap, offset=0.0):
     """Vehicles one behind the other along x at 10 m/s."""
-    t = np.arange(STEPS) / 10
+    t = arange(STEPS) / 10
     position, velocity = np.full((STEPS, count, 3), offset), np.zeros((STEPS, count, 3))
-    position[..., 0] += gap * np.arange(count) + 10.0 * t[:, None]
+    position[..., 0] += gap * arange(count) + 10.0 * t[:, None]
     velocity[..., 0] = 10.0
     return co.Fleet(tuple(f"v{i}" for i in range(count)), t, position, velocity)
 
@@ -176,7 +176,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain():
     alone is 0.7 m off."""
     drives = []
     for seed in (1, 2, 3):
-        rng, t = default_rng(seed), np.arange(60) / 10
+        rng, t = default_rng(seed), arange(60) / 10
         heading = rng.uniform(0, 2 * np.pi, 4) + np.cumsum(rng.normal(0, 0.02, (60, 4)), 0)
         velocity = 8.0 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], -1)
         position = np.append(rng.uniform(-20, 20, (4, 2)), np.zeros((4, 1)), 1) + np.cumsum(velocity / 10, 0)
@@ -192,7 +192,7 @@ def test_ranges_between_rare_fixes_say_no_more_than_where_they_point():
     1.69 m off, where a filter of the ego alone is 1.58 m off."""
     fleet = drive(3, 600, 0.2, gap=12.0)
     seen = co.observe(fleet, NOISE, co.V2X(5), runs=6)
-    rare = np.where(np.arange(600)[:, None, None] % 100, nan, seen.gnss)
+    rare = np.where(arange(600)[:, None, None] % 100, nan, seen.gnss)
     velocity = seen.velocity + default_rng(0).normal(0, 0.1, seen.velocity.shape)
     seen = without_azimuth(replace(seen, gnss=rare, velocity=velocity))
     error = errors_of("kalman joint", "100 ranges of a pair to a fix", [(fleet, seen)])

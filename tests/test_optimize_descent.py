@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy import array
 from numpy.linalg import norm
 
 import coopoc as co
@@ -15,11 +16,11 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes():
     """A range that is too short, seen nearly along the height that is known: J^T J has a 4,000th of the curvature
     across it, so that no step helps below that damping. Closed form: straight above, and the range's share of the
     height is its information's."""
-    z = np.array([9.0, 9.5])
+    z = array([9.0, 9.5])
     problem = Problem([*"av"], dimension=2, x0=[[0, 0], [0.05, 10]], fixed=(0,))
     problem = problem.add("position", "v", [0.0, 10.0], std=[1e3, 1e-3])
     found = [solve(problem.add("range", ("a", "v"), length, std=1.0)).x[1] for length in z]
-    assert np.array(found) == pytest.approx(np.c_[0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)], abs=1e-6)
+    assert array(found) == pytest.approx(np.c_[0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)], abs=1e-6)
 
 
 def test_what_hangs_on_a_weak_and_far_anchor_is_solved_to_rounding():
@@ -63,7 +64,7 @@ def test_the_unit_of_the_noise_changes_no_step(seed):
 
 
 def ranged():
-    x0 = np.array([[0.0, 0], [9, 0], [0, 9], [5, 5]])
+    x0 = array([[0.0, 0], [9, 0], [0, 9], [5, 5]])
     problem = Problem([*"abcx"], x0=x0, dimension=2).add("position", list("abc"), x0[:3], 1e-3)
     return problem.add("range", [("x", name) for name in "abc"], norm(x0[:3] - [3.0, 4.0], axis=1), 0.1)
 
@@ -83,7 +84,7 @@ def test_a_bar_shows_steps_and_cost(backend, monkeypatch, capsys):
 
 def test_a_drive_that_turns_as_a_whole_needs_few_steps():
     """Straight lines move its far end off the circle; the next step corrects that, and both keep what was promised."""
-    n, turn = 400, np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    n, turn = 400, array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
     x0 = co.pose(np.outer(np.arange(n), [1.0, 0.0]) @ turn, np.full(n, 0.5))
     drive = Problem(range(n), dimension=2, poses=range(n), x0=x0).add("pose", 0, co.pose([0, 0], 0.0), std=0.01)
     moved = np.tile(co.pose([1.0, 0.0], 0.0), (n - 1, 1))

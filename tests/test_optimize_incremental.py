@@ -6,13 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 from conftest import refused
+from numpy import array
 
 import coopoc as co
 from coopoc.optimize import Incremental, Loss, joint_covariance
 
-STD = np.array([0.05, 0.05, 0.02])
+STD = array([0.05, 0.05, 0.02])
 TRUE = [gtsam.Pose2(np.cos(0.3 * k) * 5.0, np.sin(0.3 * k) * 5.0, 0.3 * k) for k in range(25)]
-MARKS = {"l0": np.array([0.0, 1.0]), "l1": np.array([8.0, -3.0])}
+MARKS = {"l0": array([0.0, 1.0]), "l1": array([8.0, -3.0])}
 
 
 def measured():
@@ -58,7 +59,7 @@ def batch():
     for k, step in enumerate(moved):
         graph.add(gtsam.BetweenFactorPose2(k, k + 1, step, sigmas(STD)))
     for k, mark, distance in far:
-        graph.add(gtsam.RangeFactor2D(k, 100 + int(mark[1]), distance, sigmas(np.array([0.1]))))
+        graph.add(gtsam.RangeFactor2D(k, 100 + int(mark[1]), distance, sigmas(array([0.1]))))
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-15)
     return graph, gtsam.LevenbergMarquardtOptimizer(graph, guess, params).optimize()

@@ -11,6 +11,7 @@ import pytest
 import range_only
 import tightness
 from conftest import measured, refused
+from numpy import eye
 from numpy.linalg import det, eigvalsh, lstsq, qr
 from numpy.random import default_rng
 from random_graphs import scipys
@@ -73,8 +74,8 @@ def by_hand(problem):
     for e, ((i, j), r, w) in enumerate(zip(ranges.nodes, ranges.z[:, 0], ranges.root[:, 0, 0], strict=True)):
         row = np.zeros((d, size))
         for node, sign in ((i, -w), (j, w)):
-            row[:, 1 + d * node : 1 + d * node + d] = sign * np.eye(d)
-        row[:, 1 + d * (n + e) : 1 + d * (n + e) + d] = -w * r * np.eye(d)
+            row[:, 1 + d * node : 1 + d * node + d] = sign * eye(d)
+        row[:, 1 + d * (n + e) : 1 + d * (n + e) + d] = -w * r * eye(d)
         rows.append(row)
     A = np.concatenate(rows)
     Y = cp.Variable((size, size), PSD=True)
@@ -190,7 +191,7 @@ def test_the_elimination_is_numpys(make, monkeypatch):
     """C and its products by numpy.linalg.lstsq, eigenvalues by eigh and by Lanczos."""
     form = quadratic(make(0))
     small, A = Reduced(form), form.rows.toarray()
-    rest = A @ np.concatenate([np.eye(form.bound), -lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]])
+    rest = A @ np.concatenate([eye(form.bound), -lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]])
     C = rest.T @ rest
     X = form.project(default_rng(0).standard_normal((form.bound, form.columns)))
     assert small.matrix == pytest.approx(C, abs=1e-9 * abs(C).max())
@@ -272,7 +273,7 @@ def test_the_eigenvalue_is_that_of_the_whole_matrix():
         problem = tightness.anchored(seed, 4, 2, 2, 0.1)
         form = quadratic(problem)
         for solution in minima(problem, starts=6):
-            X = form.lift(solution.x, np.tile(np.eye(2), (6, 1, 1)))
+            X = form.lift(solution.x, np.tile(eye(2), (6, 1, 1)))
             Q = (form.rows.T @ form.rows).toarray()
             CX = (Q @ X)[: form.bound]
             assert abs((Q @ X)[form.bound :]).max() < 1e-4 * abs(Q).max()

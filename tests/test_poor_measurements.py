@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import holed
-from numpy import nan
+from numpy import nan, stack
 from numpy.testing import assert_array_equal
 
 from coopoc import (
@@ -62,9 +62,9 @@ RUNS = 10
 def ranged():
     """Three cars that range each other at every step; those beside the ego have their first fix a step later."""
     t = 0.5 * np.arange(200)
-    ego = np.stack([8 * t, 3 * np.sin(0.05 * t), 0 * t], -1)
-    around = np.stack([25 * np.cos(0.03 * t), 4 + 20 * np.sin(0.03 * t), 0 * t], axis=-1)
-    x = np.stack([ego, ego + around, np.stack([8 * t - 15, 0 * t - 12, 0 * t], -1)], 1)
+    ego = stack([8 * t, 3 * np.sin(0.05 * t), 0 * t], -1)
+    around = stack([25 * np.cos(0.03 * t), 4 + 20 * np.sin(0.03 * t), 0 * t], axis=-1)
+    x = stack([ego, ego + around, stack([8 * t - 15, 0 * t - 12, 0 * t], -1)], 1)
     velocity = np.diff(x, axis=0, prepend=x[:1]) / 0.5
     velocity[0] = velocity[1]
     fleet = Fleet(("ego", "around", "behind"), t, x, velocity)

@@ -162,6 +162,7 @@ def test_a_known_start_needs_no_compass():
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.0), "dt"),
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1, np.zeros(3)), "begin"),
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1).step(co.OwnMeasurement([1, 0, 0], 0.0)), "begin"),
+        (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1, np.zeros(4)).step(None), "own"),
         (lambda: co.LandmarkMeasurement([0.0, 0.4, 1.4], [1.0, 2.0, 3.0]), "the range first and > 0"),
     ],
 )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import refused, standing
+from numpy import array_equal
 
 from coopoc import LKFSA, V2X, JointFilter, Sensors, observe
 from coopoc.world.inbox import inbox, within_cap
@@ -98,14 +99,14 @@ def test_schedules_are_paired_and_repeat(crossing):
     """Fewer runs are a part of more; another schedule takes other messages of the same, for the same bytes."""
     channel = V2X(5, radius=60.0, loss=0.2, bytes_per_second=300.0, schedule="round robin")
     many, few = (inbox(observe(crossing, S2, channel, runs=runs), 2, FIX_AND_VELOCITY) for runs in (4, 2))
-    assert np.array_equal(many.arrival[:2], few.arrival)
-    assert not np.array_equal(many.arrival[0], many.arrival[1])
+    assert array_equal(many.arrival[:2], few.arrival)
+    assert not array_equal(many.arrival[0], many.arrival[1])
     nearest = inbox(observe(crossing, S2, replace(channel, schedule="nearest"), runs=4), 2, FIX_AND_VELOCITY)
-    assert not np.array_equal(nearest.arrival, many.arrival)
+    assert not array_equal(nearest.arrival, many.arrival)
     assert abs(nearest.received_bytes - many.received_bytes).max() <= 32 * 5
     for method in (JointFilter(), LKFSA()):
         track = method(observe(crossing, S2, channel, runs=2), [2])
-        assert np.array_equal(track.received_bytes[:, 0], few.received_bytes)
+        assert array_equal(track.received_bytes[:, 0], few.received_bytes)
 
 
 def test_an_unknown_schedule_is_named():

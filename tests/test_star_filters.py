@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import holed, slow_fixes, standing, textbook, without
 from filterpy.kalman import KalmanFilter
-from numpy import nan
+from numpy import diag, nan
 from numpy.linalg import eigvalsh, inv
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
@@ -181,7 +181,7 @@ def test_linear_filters_equal_filterpy(formation, laplacian):
     order, edges = [0, *recording.links.neighbour[:3]], np.hstack([-np.ones((3, 1)), np.eye(3)])
     rows = np.kron(edges.T @ edges if laplacian else edges, np.eye(3))
     peer, n = KalmanFilter(dim_x=12, dim_z=12 + len(rows), dim_u=12), np.eye(12)
-    peer.B, peer.H, peer.Q = 0.1 * n, np.vstack([n, rows]), np.diag(np.square(known.process_std * 4))
+    peer.B, peer.H, peer.Q = 0.1 * n, np.vstack([n, rows]), diag(np.square(known.process_std * 4))
     for t, seen in enumerate(recording.relative[1].reshape(40, 3, 3)):
         vectors = to_vector(seen)
         if t:
@@ -190,8 +190,8 @@ def test_linear_filters_equal_filterpy(formation, laplacian):
         else:
             ahead = vectors
         cov = known.relative_cov(seen if laplacian else np.array([spherical(*vector) for vector in ahead]))
-        cov = [np.trace(cov.mean(0)) / 3 * np.diag(np.diag(rows))] if laplacian else cov
-        noise = block_diag(np.diag([*known.gnss_variance] * 4), *cov)
+        cov = [np.trace(cov.mean(0)) / 3 * diag(diag(rows))] if laplacian else cov
+        noise = block_diag(diag([*known.gnss_variance] * 4), *cov)
         fixes = recording.gnss[1, t, order].ravel()
         z = np.append(fixes, edges.T @ vectors if laplacian else vectors)
         if t:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from conftest import refused
+from numpy import ones
 from numpy.random import default_rng
 from scipy import stats
 from scipy.spatial.transform import Rotation
@@ -84,11 +85,11 @@ def test_what_cannot_be_averaged_is_named():
     with refused("must have shape"):
         mean_interval(np.empty((0, 3)))
     with refused("must have the shape of a"):
-        paired_difference(np.ones((2, 3)), np.ones((3, 2)))
+        paired_difference(ones((2, 3)), ones((3, 2)))
     with refused(r"a = \(2, 3, 4\): must have shape \(R, E\)"):
-        paired_difference(np.ones((2, 3, 4)), np.ones((2, 3, 4)))
+        paired_difference(ones((2, 3, 4)), ones((2, 3, 4)))
     with refused("at least two seeds"):
-        over_seeds(np.ones((1, 3)))
+        over_seeds(ones((1, 3)))
 
 
 @pytest.mark.parametrize("side", [1, -1])

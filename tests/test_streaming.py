@@ -171,6 +171,7 @@ def test_bad_input_is_named_and_forgotten(name, field, given):
         stream.step(Z, U, 0.1)
     with refused(f"^{field} = "):
         one.step(**{"gnss": Z, "velocity": U, "dt": 0.1} | given)
+    assert str(getattr(one, "broadcast", "")) == str(getattr(other, "broadcast", ""))
     assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
     assert_array_equal(one.history.rows, other.history.rows)
 
@@ -231,6 +232,19 @@ def test_a_stream_forgets_whom_it_met_long_ago():
 
 
 NOMINAL = CooperativeFilter(NoiseModel.nominal(Sensors()))
+
+
+def test_a_message_given_again_says_nothing_new():
+    """Though its age is rounded."""
+    sure = list[float]()
+    for late in (0.0, 1e-6):
+        stream, other = (StarStream(NOMINAL) for _ in range(2))
+        other.step(Z, U, 0.1)
+        for k in range(9):
+            heard = RelativeMeasurement("b", [9.0, 0.0, 1.57], *other.broadcast, age=(0.1 - late) * k)  # type: ignore[misc]
+            cov = stream.step(Z if k == 0 else None, U, 0.1, neighbours=[heard])[1]
+        sure.append(cov.trace())
+    assert sure[0] == pytest.approx(sure[1], rel=1e-4)
 
 
 def test_a_star_follows_again_after_a_pause_of_one_step():

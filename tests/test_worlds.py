@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import refused
+from numpy import array_equal
 from shell import ROOT
 
 import coopoc as co
@@ -82,7 +83,7 @@ def parts(one):
 def different(one, other):
     first, second = parts(one), parts(other)
     of_links = {"range", "azimuth", "inclination", "messages"}
-    same_links = np.array_equal(first["members"], second["members"])
+    same_links = array_equal(first["members"], second["members"])
     return {
         name
         for name, value in first.items()
@@ -90,7 +91,7 @@ def different(one, other):
         and not (
             value == second[name]
             if isinstance(value, str)
-            else np.array_equal(value, second[name], equal_nan=value.dtype.kind == "f")
+            else array_equal(value, second[name], equal_nan=value.dtype.kind == "f")
         )
     }
 
@@ -138,8 +139,8 @@ def test_a_slip_alters_the_velocities_of_its_interval_alone():
         factor, start, stop = map(float, re.findall(r"velocities times (\S+), (\d+) to (\d+) s", one.text)[0])
         t, dt = one.recording.t, one.recording.dt
         inside, outside = (t > start + 1) & (t < stop - 1), (t < start - 1) | (t > stop + dt + 1)
-        assert np.array_equal(wrong[:, outside], right[:, outside])
-        assert np.array_equal(wrong[:, inside], factor * right[:, inside])
+        assert array_equal(wrong[:, outside], right[:, outside])
+        assert array_equal(wrong[:, inside], factor * right[:, inside])
 
 
 def test_late_clocks_repeat_what_was_before():
@@ -153,7 +154,7 @@ def test_late_clocks_repeat_what_was_before():
         steps = round(seconds / one.recording.dt)
         there = np.isfinite(before[:, steps:, who]) & np.isfinite(before[:, :-steps, who])
         assert there.any()
-        assert np.array_equal(gnss[:, steps:, who][there], before[:, :-steps, who][there])
+        assert array_equal(gnss[:, steps:, who][there], before[:, :-steps, who][there])
 
 
 def test_wrong_words_are_named():

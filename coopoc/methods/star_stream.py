@@ -201,11 +201,12 @@ class StarStream:
             InputError: as `FilterStream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
         names = _names(neighbours)
-        self.history.write(self._given, gnss, velocity, dt, fix_age)
+        given = np.zeros(8)
+        self.history.write(given, gnss, velocity, dt, fix_age)
         columns, own, time = self._columns(names), np.empty(OWN), self._time + float(dt)
         rows = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
         outcome = stream_rows(
-            self._given,
+            given,
             self.history.reserve(),
             self._motion,
             self._fix,
@@ -220,7 +221,7 @@ class StarStream:
         )
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
-        self._time = time
+        self._given, self._time = given, time
         own[FIX_VARIANCE:MOTION] -= (1.0 - self._model.white) * self._fix
         answer = np.empty(12 + 3 * len(columns))
         if not stream_step(self._filter, self._tries, self._model, own, rows, columns, self._start, answer):

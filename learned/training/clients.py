@@ -89,6 +89,8 @@ class Segments:
         agreed = {(p.truth.shape[1], p.dt, p.true_start) for p in parts}
         if len(agreed) != 1:
             raise InputError("pieces", agreed, "must agree in length, dt and start", "Cut all clients alike.")
+        if any(p.scale is not None for p in parts):
+            parts = [p if p.scale is not None else replace(p, scale=torch.ones_like(p.gnss[..., :1])) for p in parts]
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
     def double(self) -> "Segments":

@@ -44,6 +44,9 @@ from .cooperative_state import (
 )
 from .otherwise import Tries, measured_motion, new_tries
 
+REPEATED_S = 0.005
+"""s, between when two messages of a vehicle were sent, from which the second is not the first again."""
+
 
 @compiled
 def stream_rows(
@@ -92,7 +95,7 @@ def stream_rows(
         q[c] -= own[MORE]
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
-        if isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:
+        if isfinite(row[SPEED]) and sent > newest[AGE] + REPEATED_S:
             gap = sent - newest[AGE]
             if gap > max_age + ROUNDING:
                 newest[STEP:TYPICAL] = nan

@@ -114,11 +114,11 @@ class PoseStream:
         """
         from ...kernels.poses.ekf import PoseMeasurements, step
 
-        heading = own.row[3]
+        heading = instance("own", own, OwnMeasurement).row[3]
         if not abs(heading - self._heading) < np.pi:
             radians("heading", heading)
-        self._heading = self._heading if np.isnan(heading) else heading
-        marks = [instance("landmarks", mark, LandmarkMeasurement) for mark in landmarks]
+        given = instance("landmarks", landmarks, Sequence)
+        marks = [instance("landmarks", mark, LandmarkMeasurement) for mark in given]
         if not self._later and np.isnan(np.where(np.isnan(self._begin), own.row[:4], self._begin)).any():
             what = "must give what the first fix and compass do not"
             raise InputError("begin", None, what, "Give (x, y, z, heading).")
@@ -131,6 +131,7 @@ class PoseStream:
         measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt, np.zeros((2, 3)))
         memory = self._poses, self._pair, self._faults
         step(measured, self._noise, self._begin, self._spread, *memory, 0, t)
+        self._heading = self._heading if np.isnan(heading) else heading
         self._later, d = True, self._noise.d
         x = self._poses.x[:d].copy()
         x[3] = wrap(x[3])
