@@ -101,8 +101,8 @@ from .otherwise import JUMPED, LOUDEST_NOISE, SHOWN, drive, learn_fix, score, tu
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
-NOTHING_NEW = 1e-9
-"""Least share of new fixes in a sum."""
+LEAST_NEW = 0.01
+"""Least weight of new fixes in a sum, in fixes as they are assumed: less are rounded ages, or numbers of 32 bits."""
 CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 FIX_SCORE = 16.0
@@ -248,10 +248,11 @@ def message_rows(
     for c in range(3):
         weight, r = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c]
         old = keep / status[LAST + 3 + c] if again else 0.0
-        if weight < (1.0 - NOTHING_NEW) * old:  # the sender has begun anew
+        least = LEAST_NEW / r
+        if weight < old - least:  # the sender has begun anew
             old = 0.0
         new, z, h.block[MEASURED + c] = weight - old, rows[row, SOLO + c], False
-        if new < NOTHING_NEW * weight or weight * NO_POSITION < 1.0:
+        if (old > 0.0 and new < least) or weight * NO_POSITION < 1.0:
             continue
         white = model.white[c] / new * math.exp(f.ego[LEVEL + MESSAGES])
         if old > 0.0:
