@@ -117,7 +117,7 @@ class PoseStream:
         heading = instance("own", own, OwnMeasurement).row[3]
         if not abs(heading - self._heading) < np.pi:
             radians("heading", heading)
-        given = instance("landmarks", landmarks, Sequence)
+        given = landmarks if isinstance(landmarks, Sequence) else [landmarks]
         marks = [instance("landmarks", mark, LandmarkMeasurement) for mark in given]
         if not self._later and np.isnan(np.where(np.isnan(self._begin), own.row[:4], self._begin)).any():
             what = "must give what the first fix and compass do not"
