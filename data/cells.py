@@ -53,6 +53,8 @@ OTHER_MEANINGS = "rate vertical acc accel accuracy std sigma error variance cov"
 """Words beside which these mean something else."""
 
 
+UNNAMED = "unnamed"
+"""Column without a header, as of an index that pandas writes, where it does not count rows."""
 LARGEST_TABLE = 2**27
 """Numbers in a Parquet table: 1 GB."""
 
@@ -76,16 +78,22 @@ def read_frame(path: Path, *text: str) -> DataFrame:
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
         raise _no_table(path, said(error)) from None
-    frame.columns = pd.Index([str(name).strip() for name in frame.columns])
-    if "" in frame and (frame.columns[0] == "" or frame[""].isna().all()):
-        frame = frame.drop(columns="")  # an index, as pandas writes it, or what is behind a last comma
+    frame.columns = pd.Index([*map(_plain, frame.columns)])
     _check_header(path, list(frame.columns))
+    if "" in frame and (frame[""].dtype.kind == "i" or frame[""].isna().all()):
+        frame = frame.drop(columns="")  # numbers of rows, as pandas writes them, or what is behind a last comma
+    frame = frame.rename(columns={"": UNNAMED})
     frame.index += 1
     return frame
 
 
+def _plain(name: object) -> str:
+    """A header as it is compared, "" of an index without a name."""
+    return str(name).strip().removeprefix("__index_level_0__")
+
+
 def _read_parquet(path: Path) -> DataFrame:
-    """The table without the index that pandas numbers rows with, words as objects.
+    """The table, words as objects.
 
     A column, a list or a word that is the same throughout takes no room in the file, and what the footer says of sizes
     may be false (some of it makes Arrow abort): they are counted in the headers of the pages, and each word is read
@@ -114,7 +122,7 @@ def _read_parquet(path: Path) -> DataFrame:
                 at = file.tell() + page[3]
         within(count)
     table = read_table(path, read_dictionary=[b".".join(chunk[3]).decode() for chunk in chunks])
-    frame: DataFrame = table.to_pandas(ignore_metadata=True).filter(regex="^(?!__index_level_)")
+    frame: DataFrame = table.to_pandas(ignore_metadata=True)
     words = frame.select_dtypes("category")
     within(len(frame) * max((len(str(word)) for name in words for word in words[name].cat.categories), default=0) // 8)
     return frame.astype(dict.fromkeys(words, object))
@@ -147,9 +155,9 @@ def headers(path: Path) -> list[str]:
         if path.suffix.lower() == ".parquet":
             from pyarrow.parquet import read_schema
 
-            return [str(name) for name in read_schema(path).names]
+            return [_plain(name) or UNNAMED for name in read_schema(path).names]
         csv_file = path.suffix.lower() == ".csv"
-        return [str(name).strip() for name in (_first_lines(path)[1] if csv_file else read_frame(path))]
+        return [_plain(name) or UNNAMED for name in (_first_lines(path)[1] if csv_file else read_frame(path))]
     except Exception:  # of Arrow and csv
         return []
 

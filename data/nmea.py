@@ -21,6 +21,12 @@ MIN_COG_SPEED_M_S = 0.5
 """m/s, below which a course over ground is noise."""
 
 
+def is_nmea(path: Path) -> bool:
+    """Whether a text begins with sentences of a receiver."""
+    with path.open("rb") as file:
+        return bool(re.search(rb"\$..(GGA|RMC|GST),", file.read(2000)))
+
+
 def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
     """Rows latitude, longitude, height (ellipsoidal: altitude and geoid separation), speed and compass_deg of a file,
     which is named after its vehicle.

@@ -102,7 +102,8 @@ def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path):
     for name, other, x in zip("ab", "ba", (0.0, 12.0), strict=True):
         seen = {f"range_{other}": 12.0, f"range_{other}_std": 0.2, "range_kept": "yes"}
         write(pd.DataFrame({"t": t, "x": 5 * t + x, "y": 0.0, "vx": 5.0, "vy": 0.0} | seen), tmp_path / f"{name}.csv")
-    co.write_tum(tmp_path / "GT_b.tum", t, np.outer(t, [5, 0, 0]))
+    (tmp_path / "GT").mkdir()
+    co.write_tum(tmp_path / "GT" / "b.tum", t, np.outer(t, [5, 0, 0]))
     log = read_log(tmp_path)
     assert log.truth.position[-1, 1, 0] == 47.5
     assert (log.recording.sensors.range_std, np.nanmax(log.recording.relative)) == pytest.approx((0.2, 12.0))
@@ -122,6 +123,9 @@ def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhe
     assert log.summary.refused["files of kinds that are not read"] == (1, "truth.csv.gz")
     assert log.recording.sensors.gnss_std[:2] == pytest.approx((2.5, 2.5))
     assert any("std of fixes.csv is the standard deviation of each of x, y" in one for one in log.summary.assumed)
+    (folder / "old").mkdir()
+    write(fixes, folder / "old" / "gps.csv")
+    assert "left out: old. " in f"{read_log(folder).summary}"
     write(fixes.assign(t=t + 0.1), folder / "gps.csv")
     write(motion.assign(t=t + 0.1), folder / "wheel.csv")
     assert "one kind of car (motion.csv, wheel.csv), car (fixes.csv, gps.csv) come" in f"{read_log(folder).summary}"

@@ -53,8 +53,8 @@ def test_nmea_is_fixes_speed_and_course(tmp_path):
     pytest.importorskip("pynmeagps")
     fleet = drive(2, steps=100)
     start = datetime(2024, 2, 28, 23, 59, 55)
-    for column, name in enumerate("ab"):
-        (tmp_path / f"{name}.nmea").write_text(nmea(fleet, column, start))
+    for column, name in enumerate(("a.nmea", "b.log")):
+        (tmp_path / name).write_text(nmea(fleet, column, start))
     rec = read_log(tmp_path, origin=(48.14, 11.58, 560.0)).recording
     assert_allclose(rec.gnss[0], fleet.position, atol=1e-3)
     assert_allclose(rec.velocity[0, 2:], fleet.velocity[2:], atol=0.05)

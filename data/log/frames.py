@@ -140,7 +140,7 @@ def on_one_clock(rows: Rows, clock: Factors) -> Rows:
 
 def check_one_drive(rows: Rows, name: str) -> None:
     """InputError for files of measurements that are too far apart in time to be of one drive."""
-    spans = rows[rows["true"] == 0].groupby("file", sort=False)["t"].agg(["min", "max"]).dropna().sort_values("min")
+    spans = rows.groupby("file", sort=False)["t"].agg(["min", "max"]).sort_values("min")
     gaps = spans["min"] - spans["max"].cummax().shift()
     if (gaps > max(DRIVES_APART, spans["max"].max() - spans["min"].min() - gaps.clip(lower=0.0).sum())).any():
         raise InputError(

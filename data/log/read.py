@@ -37,13 +37,14 @@ from ..comma import is_segment, read_segment
 from ..graphs import read_pyfg_rows
 from ..librsf import is_librsf, read_librsf
 from ..nclt import FILE_NAMES, read_nclt
-from ..nmea import DAY_S, read_nmea
+from ..nmea import DAY_S, is_nmea, read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, check_one_drive, check_origin, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Members, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
 from .units import (
+    BELOW,
     KIND_TABLE,
     KINDS,
     QUATERNION,
@@ -74,9 +75,11 @@ FREQUENT_SHARE = 0.1
 
 
 def _read_text(file: Path, summary: Summary, **_: Any) -> Rows:
-    """Rows of libRSF, else of a truth `t x y z qx qy qz qw`, whose orientation is perhaps a camera's."""
+    """Rows of libRSF or NMEA, else of a truth `t x y z qx qy qz qw`, whose orientation is perhaps a camera's."""
     if is_librsf(file):
         return read_librsf(file, summary)
+    if is_nmea(file):
+        return read_nmea(file, summary)
     lines, table = read_rows(file, "t x y z qx qy qz qw")
     frame = pd.DataFrame(table[:, :4], lines, [*"txyz"])
     return of_kinds(frame.assign(vehicle=file.stem), file.name)
@@ -86,7 +89,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
     **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
-    **dict.fromkeys((".txt", ".tum"), _read_text),
+    **dict.fromkeys((".txt", ".tum", ".log"), _read_text),
     ".pt": read_nclt,
     ".pyfg": read_pyfg_rows,
 }
@@ -146,7 +149,7 @@ def is_log(path: Path, columns: Names | None = None) -> bool:
     """
     if path.is_dir():
         return _is_bag(path) or is_segment(path) or bool(_files(path))
-    return is_log_table(path, columns) if path.suffix.lower() in TABLES else _is_read(path)
+    return is_log_table(path, columns) if path.suffix.lower() in TABLES else _is_read(path, path.parent)
 
 
 def read_log(
@@ -258,14 +261,14 @@ def read_log(
     for column in ("t", "arrival"):
         for file, times in rows[column].where(np.isfinite).groupby(rows["file"]):
             check_time(times.to_numpy(), str(file), column)
-    check_one_drive(rows, path.name)
     if origin is not None and not rows["kind"].isin(ENU).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     measured = rows["true"] == 0
     summary.rows = int(measured.sum())
     summary.logged = rows.groupby("vehicle")["kind"].unique().to_dict()
-    rows, true_rows = not_vague(rows[measured], summary), rows[~measured]
-    rows, origin = local(on_one_clock(rows, clock or {}), origin, summary)
+    rows, true_rows = on_one_clock(not_vague(rows[measured], summary), clock or {}), rows[~measured]
+    check_one_drive(rows, path.name)
+    rows, origin = local(rows, origin, summary)
     alone = rows[in_group(rows, "fix", "odometry", "heading")]
     spans = alone.groupby(["vehicle", "kind", "file"])["t"].agg(["min", "max"]).reset_index().sort_values("min")
     for (name, _), parts in spans.groupby(["vehicle", "kind"]):
@@ -351,12 +354,12 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or READERS.get(path.suffix.lower()) is read_bag
 
 
-def _is_read(file: Path) -> bool:
+def _is_read(file: Path, path: Path) -> bool:
     ending = file.suffix.lower()
     if ending == ".pt":
         return file.name in FILE_NAMES
-    if ending in (".txt", ".tum") and file.is_file():
-        return is_librsf(file) or bool(TRUE_NAME.search(file.stem))
+    if READERS.get(ending) is _read_text and file.is_file():
+        return is_librsf(file) or is_nmea(file) or _is_true(file, path)
     return ending in READERS
 
 
@@ -373,10 +376,12 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = _files(path) if path.is_dir() else [path]
-        summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
-        strange = sorted(file.name for file in path.glob("[!.]*") if file.is_file() and not _is_read(file))
+        below = {file.relative_to(path).parts[0] for file in {*_every_file(path)} - {*files, *true_files}}
+        if below:
+            summary.assume(f"{BELOW}: {', '.join(sorted(below))}. Move the files into folders, too, or name one")
+        strange = sorted(file.name for file in path.glob("[!.]*") if file.is_file() and not _is_read(file, path))
         summary.refuse("files of kinds that are not read", len(strange), ", ".join(strange))
-        true_by_name = [f for f in files if TRUE_NAME.search(f.stem) and f != path]
+        true_by_name = [f for f in files if _is_true(f, path)]
         true_files = true_files or true_by_name
         files = [f for f in files if f not in (*true_files, *true_by_name)]
         if not files:
@@ -403,25 +408,32 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
 
 
 def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows:
-    """Rows of a file of a log; what names no vehicle in a folder below is of the vehicle of that folder."""
+    """Rows of a file of a log; what names no vehicle in a folder below, but one of the truth, is of the vehicle of that
+    folder."""
     read: Callable[..., Rows] = READERS.get(file.suffix.lower(), read_log_table)
     rows = read(file, summary, **options)
     if path not in file.parents or file.parent == path:
         return rows
-    rows = rows.assign(file=str(file.relative_to(path)))
-    return rows.assign(vehicle=file.relative_to(path).parts[0]) if rows["vehicle"].eq(file.stem).all() else rows
+    rows, parts = rows.assign(file=str(file.relative_to(path))), file.relative_to(path).with_suffix("").parts
+    named_after = next((part for part in parts if not TRUE_NAME.search(part)), file.stem)
+    return rows.assign(vehicle=named_after) if rows["vehicle"].eq(file.stem).all() else rows
 
 
 def _every_file(path: Path) -> list[Path]:
-    return [file for file in path.rglob("[!.]*") if _is_read(file)]
+    return [file for file in path.rglob("[!.]*") if _is_read(file, path)]
+
+
+def _is_true(file: Path, path: Path) -> bool:
+    """Whether a file, or a folder of the log that it is in, is named as a truth."""
+    return file != path and any(map(TRUE_NAME.search, file.relative_to(path).with_suffix("").parts))
 
 
 def _files(path: Path) -> list[Path]:
-    """Files of a folder, and those of a folder per vehicle where it has none itself but a truth."""
+    """Files of a folder, those of the truth, and those of a folder per vehicle where it has none itself."""
     every = _every_file(path)
-    bare = not any(_is_bag(file) or (file.parent == path and not TRUE_NAME.search(file.stem)) for file in every)
+    bare = not any(_is_bag(file) or (file.parent == path and not _is_true(file, path)) for file in every)
     bare = bare and any(map(is_log, every))
-    return sorted(file for file in every if bare or file.parent == path)
+    return sorted(file for file in every if bare or file.parent == path or _is_true(file, path))
 
 
 def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
@@ -463,7 +475,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
             f"{summary.name}: t",
             f"{begin:.10g} s throughout",
             "must hold two instants or more",
-            "Is the file complete?",
+            f"Is the file complete? {summary.unread}".rstrip(),
         )
     step = dt or float(f"{max(summary.odometry or fixes, SHORTEST_STEP):.3g}")
     if not step > 0:

@@ -120,8 +120,8 @@ def _long(frame: DataFrame, file: str, summary: Summary, kinds: Names, ignore: S
 def _wide(frame: DataFrame, file: str, summary: Summary, kinds: Names, ignore: Sequence[str]) -> DataFrame:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     columns = {"arrival" if kind == "message" else kind: (kind, "") for kind in KINDS}
-    for name in () if "partner" in frame else map(str, frame.select_dtypes("number")):
-        if named := _of_partner(name):
+    for name in () if "partner" in frame else map(str, frame.select_dtypes(exclude=["bool", "datetime", "datetimetz"])):
+        if (named := _of_partner(name)) and pd.to_numeric(frame[name].astype(str), errors="coerce").notna().any():
             columns[name] = named
     columns = {name: of for name, of in columns.items() if name in frame and of[0] not in ignore}
     if not columns:

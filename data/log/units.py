@@ -75,6 +75,8 @@ UNIT = (
     "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one. "
     "Are few rows so, as where a counter begins anew? Remove them."
 )
+BELOW = "folders beside files are left out"
+"""Beginning of a sentence."""
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
 KEYS = ["vehicle", "t", "kind"]
@@ -315,9 +317,10 @@ class Summary:
 
     @property
     def unread(self) -> str:
-        """Sentences on columns that are of no kind."""
+        """Sentences on columns that are of no kind, and on folders that are left out."""
         hint = "Name what is meant with columns= or kinds=. A truth is another table: truth=FILE."
-        return f"columns not read: {self.columns}. {hint}" if self.columns else ""
+        columns = [f"columns not read: {self.columns}. {hint}"] * bool(self.columns)
+        return " ".join(columns + [f"{each}." for each in self.sentences if each.startswith(BELOW)])
 
     @property
     def columns(self) -> str:
