@@ -44,7 +44,8 @@ class Checkpoint:
         named("card", self.card, "Give name -> value.")
 
     def after(self, row: int) -> Gain:
-        """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""
+        """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start. It is not
+        calibrated."""
         rows = () if self.history is None else self.history
         kept = whole("row", row, 0, len(rows) - 1, "This checkpoint holds no more weights.")
         return unflatten(rows[kept], self.model)
@@ -137,7 +138,7 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     size = sum(p.numel() for p in model.parameters())
     if history is not None and history.shape[1:] != (size,):
         raise InputError(f"checkpoint {path}: history", history.shape, f"must be (rows, {size})", "Train it again.")
-    return Checkpoint(model, card, history)
+    return Checkpoint(model.eval(), card, history)
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -179,7 +179,7 @@ def _federated(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoin
     plan = job.recipe.plan
     how = plan.rounds, plan.aggregate, plan.local_epochs, job.setting.seed, plan.schedule, stage
     done = federate(untrained(job), data, *how)
-    return Checkpoint(done.model.calibrate([client.training for client in data]), done.card, done.weights)
+    return Checkpoint(done.model, done.card, done.weights)
 
 
 def _fitted(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:

@@ -16,6 +16,7 @@ from coopoc.evaluate.ledger import of_training
 from coopoc.text import short_repr
 
 from ..nets.gain import Gain, unflatten
+from ..training.clients import Segments
 from .rules import LARGEST_LOSS, SERVER
 
 AGREEMENT = 0.1
@@ -81,6 +82,7 @@ class Federation:
         sizes: (C,) training pieces of each client.
         seconds: of training.
         names: (C,) of the clients.
+        parts: (C,) training pieces, by which a net is calibrated.
     """
 
     like: Gain
@@ -88,6 +90,7 @@ class Federation:
     sizes: tuple[int, ...]
     seconds: float
     names: tuple[str, ...] = ()
+    parts: Sequence[Segments] = ()
 
     __repr__ = short_repr
 
@@ -126,9 +129,9 @@ class Federation:
         return float(np.average(losses[self.history.index(row)], weights=sizes))
 
     def after(self, rounds: int) -> Gain:
-        """The global net after so many rounds, 0 being the start."""
+        """The global net after so many rounds, 0 being the start, calibrated."""
         rounds = whole("rounds", rounds, 0, len(self.history) - 1, "See history.")
-        return unflatten(self.history[rounds].weights, self.like)
+        return unflatten(self.history[rounds].weights, self.like).calibrate(self.parts)
 
 
 def reports(

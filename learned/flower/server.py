@@ -43,7 +43,7 @@ cannot be verified."""
 
 
 class Row(NamedTuple):
-    """A round: number, weights (P,), losses m^2 and pieces by client, reasons of rejection, and a note."""
+    """A round: number, weights (P,), losses m^2 and pieces by client, reasons of rejection, a note, and who sent."""
 
     number: int
     weights: Tensor
@@ -52,6 +52,7 @@ class Row(NamedTuple):
     pieces: dict[str, int]
     rejected: dict[str, str]
     note: str = ""
+    sent: Sequence[str] = ()
 
     @property
     def line(self) -> str:
@@ -167,7 +168,7 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
                 combined, metrics = super().aggregate_train(server_round, list(good.values()))
             if combined is not None:
                 now = _theta(combined).to(theta.dtype)
-            self.row = Row(server_round, now, losses, {}, pieces, rejected, note)
+            self.row = Row(server_round, now, losses, {}, pieces, rejected, note, [*answers])
             return combined, metrics
 
         def aggregate_evaluate(self, server_round: int, replies: "Iterable[Message]") -> Any:
@@ -268,8 +269,8 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
                 row.weights,
                 tuple(row.training_loss.get(name, nan) for name in names),
                 tuple(last[name] for name in names),
-                dict.fromkeys(row.training_loss, size + 4),
-                dict.fromkeys(row.training_loss, 2 * size),  # to train, and to validate
+                dict.fromkeys(row.sent, size + 4),
+                dict.fromkeys(row.sent, 2 * size),  # to train, and to validate
                 row.rejected,
                 dict.fromkeys(absent, "no answer") if row.number else {},
                 row.note,

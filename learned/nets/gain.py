@@ -23,7 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from coopoc import Method
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, instance
+from coopoc.errors import InputError
 
 from ..engine.backward import Moments, Outcome, Update, advance
 from ..method import LearnedGain
@@ -152,6 +153,15 @@ def over_time(values: Tensor, counted: Tensor) -> Tensor:
     return torch.where(there, rows, 0.0).sum(-1) / there.sum(-1).clamp(min=1)
 
 
+def check_net(model: Gain) -> None:
+    """InputError for what is no net, or has a parameter that is not to be trained."""
+    instance("model", model, Gain, "Give GainNet().")  # type: ignore[type-abstract]
+    for name, parameter in model.named_parameters():
+        if not parameter.requires_grad:
+            allowed = "must be True: all parameters are trained"
+            raise InputError(f"requires_grad of {name}", False, allowed, "Keep what is fixed as a buffer.")
+
+
 def flatten(models: Sequence[nn.Module]) -> Tensor:
     """(S, P) weights of S models of one shape, in the order of `parameters()`.
 
@@ -163,6 +173,6 @@ def flatten(models: Sequence[nn.Module]) -> Tensor:
 
 def unflatten(weights: Tensor, like: Net) -> Net:
     """A new model shaped as `like` with the weights (P,)."""
-    model = copy.deepcopy(like)
+    model = copy.deepcopy(like).eval()
     nn.utils.vector_to_parameters(weights.detach().clone(), model.parameters())
     return model

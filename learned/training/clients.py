@@ -3,11 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from math import nan
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.arrays import TINY, AnyArray, Floats, check_fields, instance, number, one_of, whole
@@ -85,13 +87,19 @@ class Segments:
 
     @classmethod
     def join(cls, parts: "Sequence[Segments]") -> "Segments":
-        """All pieces of several parts in their order; the parts agree in length, dt and start."""
-        agreed = {(p.truth.shape[1], p.dt, p.true_start) for p in parts}
+        """All pieces of several parts in their order; the parts agree in dt and start. Behind the end of shorter ones
+        there is neither a fix nor a truth."""
+        agreed, longest = {(p.dt, p.true_start) for p in parts}, max((p.truth.shape[1] for p in parts), default=0)
         if len(agreed) != 1:
-            raise InputError("pieces", agreed, "must agree in length, dt and start", "Cut all clients alike.")
+            raise InputError("pieces", agreed, "must agree in dt and start", "Cut all clients alike.")
         if any(p.scale is not None for p in parts):
             parts = [p if p.scale is not None else replace(p, scale=torch.ones_like(p.gnss[..., :1])) for p in parts]
-        return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
+        beyond, more = {"velocity": 0.0, "scale": 1.0}, [(0, 0, 0, longest - p.truth.shape[1]) for p in parts]
+        return parts[0]._each(
+            lambda name: torch.cat(
+                [pad(getattr(p, name), by, value=beyond.get(name, nan)) for p, by in zip(parts, more, strict=True)]
+            )
+        )
 
     def double(self) -> "Segments":
         """The same pieces in float64."""

@@ -16,7 +16,7 @@ from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 from ..engine.backward import Moments, Update
-from ..nets.gain import Gain, flatten, unflatten
+from ..nets.gain import Gain, check_net, flatten, unflatten
 from ..nets.okf import NoiseParameters
 from .clients import Batch, Segments, check_segments, mirrored
 from .schedule import Schedule, cosine, generator, one_core, watched
@@ -37,19 +37,21 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A trained net: a net of its shape, how it went, why it stopped early (None: it did not), seconds."""
+    """A trained net: a net of its shape, how it went, why it stopped early (None: it did not), seconds, and what it was
+    trained on."""
 
     like: Gain
     history: tuple[Progress, ...]
     stopped: str | None
     seconds: float
+    training: Segments
 
     __repr__ = short_repr
 
     @cached_property
     def model(self) -> Gain:
-        """The net with the weights that validated best."""
-        return unflatten(self.best.weights, self.like)
+        """The net with the weights that validated best, calibrated."""
+        return unflatten(self.best.weights, self.like).calibrate([self.training])
 
     @property
     def best(self) -> Progress:
@@ -90,7 +92,7 @@ def fit(
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
     2
     """
-    instance("model", model, Gain, "Give GainNet().")  # type: ignore[type-abstract]
+    check_net(model)
     instance("schedule", schedule, Schedule)
     for field, value in {
         "training": training,
@@ -111,7 +113,7 @@ def fit(
             history.append(Progress(step, theta[0].clone(), mean, float(judge(theta))))
     if not stopped and min(row.validation_loss for row in history) == inf:
         stopped[0] = "no weights had a finite validation loss; start from GainNet(start_gain=0.1)"
-    return Fit(model, tuple(history), stopped.get(0), perf_counter() - began)
+    return Fit(model, tuple(history), stopped.get(0), perf_counter() - began, training)
 
 
 def descend(
