@@ -301,7 +301,7 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
     axes.plot(list(points), list(map(_mean, points.values())), **options)
     if bands:
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
-        if options["linestyle"] == "none":
+        if options["linestyle"] == "none" or len(bands) == 1:
             axes.vlines(list(bands), *ends, alpha=0.6, color=options["color"], linewidth=1.2)
             return
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)

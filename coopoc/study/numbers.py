@@ -1,6 +1,8 @@
 """numbers: one number of a selection of a study's rows, for tables, figures and findings; None where it was not run."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import reduce
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -41,18 +43,19 @@ def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str,
 
 def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     """Mean of a metric over egos, runs and training seeds."""
-    return next((float(values.mean()) for values in _values(results, where, value)), None)
+    return next((float(values.mean()) for values in _values(results, where, value)[0]), None)
 
 
 def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval | None:
     """Mean of a metric over egos, runs and training seeds, with its interval over egos, then runs."""
-    return next(map(mean_interval, _values(results, where, value)), None)
+    values, lost = _values(results, where, value)
+    return replace(mean_interval(values[0]), lost=lost) if values else None
 
 
-def _values(results: Results, where: Where, value: str) -> list[Floats]:
-    """(R, E) of a metric for the egos that have it in all runs; nothing if none has."""
+def _values(results: Results, where: Where, value: str) -> tuple[list[Floats], int]:
+    """(R, E) of a metric for the egos that have it in all runs, nothing if none has, and how many values they lack."""
     kept = present(results, where, value)
-    return [] if kept is None else paired(results, value, kept)[0]
+    return ([], 0) if kept is None else paired(results, value, kept)
 
 
 def rms(results: Results, where: Where) -> float | None:
@@ -67,13 +70,14 @@ def rms(results: Results, where: Where) -> float | None:
 
 def paired(results: Results, value: str, *wheres: Where) -> tuple[list[Floats], int]:
     """(R, E) of a metric of each selection for the egos and runs that all of them have, nothing if there are none, and
-    how many others any of them has."""
+    how many others egos have that any of them has."""
     from .results import whole
 
     grids = [results.grid(value, where) for where in wheres]
-    union = sum(grids[1:], grids[0])
+    union, there = sum(grids[1:], grids[0]), reduce(lambda one, other: one.combine_first(other), grids)
     kept = whole(union)
-    return [grid.loc[kept.index, kept.columns].to_numpy().T for grid in grids if kept.size], union.size - kept.size
+    lost = there.dropna(how="all").size - kept.size
+    return [grid.loc[kept.index, kept.columns].to_numpy().T for grid in grids if kept.size], lost
 
 
 def difference(results: Results, method: Where, base: Where) -> Interval | None:
@@ -86,7 +90,8 @@ def failures(results: Results, where: Where) -> Any:
     rows = results.failures
     for name in where.keys() & rows:
         wanted = where[name]
-        rows = rows[rows[name].isin(wanted if isinstance(wanted, list) else [wanted])]
+        there = rows[name].astype(object).where(rows[name].notna(), None)
+        rows = rows[there.isin(wanted if isinstance(wanted, list) else [wanted])]
     return rows
 
 
@@ -177,7 +182,7 @@ def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
         return {}
     *each, kept = values
     left_out = f", but {lost} pairs that lack a value" if lost else ""
-    intervals = {f"over egos and runs{left_out}": paired_difference(np.mean(each, axis=0), kept)}
+    intervals = {f"over egos and runs{left_out}": replace(paired_difference(np.mean(each, axis=0), kept), lost=lost)}
     if len(each) > 1:
         intervals[f"over {len(each)} training seeds"] = over_seeds(np.array(each) - kept)
     return intervals
@@ -190,7 +195,8 @@ EQUAL_SHARE = 1e-3
 def sign(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> int:
     """Sign of the difference of two selections, which decides who is better in every table and sentence.
 
-    0 if noise or training can explain it or it is below EQUAL_SHARE: an interval of it is not beyond, or is unknown.
+    0 if noise or training can explain it or it is below EQUAL_SHARE: an interval of it is not beyond, or is unknown, or
+    lacks pairs.
 
     >>> from pandas import DataFrame
     >>> from coopoc.study.results import Results
@@ -199,10 +205,11 @@ def sign(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
     >>> [sign(Results("s", "?", (), {}, frame, frame[:0], 0, {}), {"method": "a"}, {"method": of}) for of in "bcd"]
     [-1, 0, 0]
     """
-    there, back = (gaps(results, *both, value).values() for both in ((first, second), (second, first)))
+    there, back = ([*gaps(results, *both, value).values()] for both in ((first, second), (second, first)))
     ends = np.array([(gap.low, gap.high) for gap in there] + [(-gap.high, -gap.low) for gap in back])
     least = EQUAL_SHARE * abs(mean(results, second, value) or 0.0)
-    return int((ends > least).all()) - int((ends < -least).all())
+    known = not any(gap.lost for gap in there)
+    return known * (int((ends > least).all()) - int((ends < -least).all()))
 
 
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from ..workers import progress_bar
 from . import store
 from .results import Results
 from .study import Study
-from .tables import Table
+from .tables import FORMATS, Table
 
 VIEWS = "views.json"
 _FIELDS = {
@@ -64,9 +65,8 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool) 
         before = _stored(folder)
         for kind, listed in shown.items():
             old = {view["name"] for view in before[kind]} - {view["name"] for view in listed}
-            for path in (folder / kind).glob("*.*"):
-                if path.stem in old:
-                    path.unlink()
+            for name, suffix in product(old, (*FORMATS.values(), "pdf", "png", "svg")):
+                (folder / kind / f"{name}.{suffix}").unlink(missing_ok=True)
     stored = {
         "cells": [*store.read(folder).cells],
         **shown,

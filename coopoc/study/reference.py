@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -18,7 +18,7 @@ from ..plugins import names
 from ..workers import say
 from . import store
 from .cell import Params
-from .results import SEED, Results, ego_by_run, whole
+from .results import SEED, Results, ego_by_run, lacking, whole
 from .study import find_study
 from .style import label, words
 from .tables import Entry, Table
@@ -99,6 +99,8 @@ class Change(NamedTuple):
         >>> Change(was, 1.2, Interval(0.2, 0.19, 0.21, 3), "lower").verdict
         'worse'
         """
+        if math.isnan(self.now):  # a run of an ego has lost its number
+            return "worse"
         if self.difference.low <= 0 <= self.difference.high:
             return "within noise"
         if isinstance(self.better, str):
@@ -142,8 +144,11 @@ def measure(results: Results, metrics: Iterable[str]) -> Reference:
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
         tolerance = TRAINED_TOLERANCE if SEED in rows and rows[SEED].notna().any() else PAIRED_TOLERANCE
         for metric in metrics:
-            each = whole(ego_by_run(rows, metric)).to_numpy() if metric in rows else np.empty((0, 0))
-            if each.size:
+            grid = ego_by_run(rows, metric) if metric in rows else rows.iloc[:0, :0]
+            each = whole(grid).to_numpy()
+            if lacking(grid):
+                numbers.append(Number(where, metric, math.nan, 1, 0.0, tolerance))
+            elif each.size:
                 runs = each.shape[1]
                 std = each.mean(axis=0).std(ddof=1) if runs > 1 else 0.0
                 mean, std = (float(f"{value:.6g}") for value in (each.mean(), std))  # more depends on the machine
@@ -237,6 +242,7 @@ def reference(
         raise InputError("study", of.name, "has no reference numbers", "Name its metrics, and give --file.")
     if write:
         made = measure(results, of.metrics)
+        made = replace(made, numbers=tuple(number for number in made.numbers if number.value == number.value))
         made.save(file)
         say(f"{len(made.numbers)} numbers are in {file}")
         return 0

@@ -136,7 +136,7 @@ class Results:
         yield from frame.groupby(by, sort=False, dropna=False)
 
     def summary(self, by: Sequence[str], value: str, where: Params | None = None) -> DataFrame:
-        """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (egos left out).
+        """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (values left out).
 
         A metric that a combination does not have at all is NaN with n = 0.
 
@@ -149,8 +149,7 @@ class Results:
             table = ego_by_run(frame[frame["status"] != "failed"] if "status" in frame else frame, value)
             grid = whole(table)
             each = mean_interval(grid.to_numpy().T) if grid.size else NO_VALUES
-            missing = len(table) - len(grid) * bool(grid.size or frame[value].isna().all())
-            rows.append([*names, *vars(each).values(), missing])
+            rows.append([*names, *vars(replace(each, lost=lacking(table))).values()])
         return DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
     def _one_cell(self, frame: DataFrame, by: Sequence[str], value: str) -> None:
@@ -176,7 +175,7 @@ def _joined(tables: Sequence[pa.Table]) -> DataFrame:
 
 
 def ego_by_run(frame: DataFrame, value: str) -> DataFrame:
-    """Egos x runs: means over training seeds, NaN where a seed has no finite one; rows without ego or run count as one.
+    """Egos x runs: means over training seeds, NaN where a seed has none; rows without ego or run count as one.
 
     >>> ego_by_run(DataFrame({"x": [1.0, 3.0], "run": [None, None]}), "x").to_numpy().tolist()
     [[2.0]]
@@ -184,10 +183,15 @@ def ego_by_run(frame: DataFrame, value: str) -> DataFrame:
     keys = frame.reindex(columns=["ego", "run"])
     keys = keys.astype(object).where(keys.notna(), 0)
     values = frame[value].astype(float)
-    cells = values.where(np.isfinite(values)).groupby([keys["ego"], keys["run"]])
+    cells = values.groupby([keys["ego"], keys["run"]])
     return cells.mean().where(cells.count() == cells.size()).unstack("run")
 
 
 def whole(table: DataFrame) -> DataFrame:
-    """The egos with a value in every run in which any has one."""
-    return table.dropna(axis="columns", how="all").dropna()
+    """The egos with a finite value in every run in which any has one."""
+    return table.where(np.isfinite(table)).dropna(axis="columns", how="all").dropna()
+
+
+def lacking(table: DataFrame) -> int:
+    """How many values `whole` lacks of egos that have any."""
+    return table.dropna(how="all").size - whole(table).size

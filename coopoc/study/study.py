@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from ..errors import InputError
 from ..paths import file_name
 from ..plugins import file_digest, find, from_file, in_file
 from .cell import Cell, Params, Row, Scalar, digest, entries, parse
-from .provenance import code_of
+from .provenance import code_of, revision
 
 if TYPE_CHECKING:
     from .plot import Plot
@@ -226,7 +225,7 @@ def _named(study: Study, params: Mapping[str, Scalar], code: Callable[[], str]) 
         "key": study.key(values),
         "code": code(),
         "files": {name: file_digest(v, name) for name, v in values.items() if isinstance(v, str) and in_file(v)},
-        "coopoc": metadata.version("coopoc"),
+        "coopoc": revision("coopoc"),
     }
     return Cell(params, values, digest(content))
 

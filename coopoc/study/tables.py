@@ -194,8 +194,9 @@ class Table:
         return bold
 
     def ranked(self) -> list[list[tuple[float, int, int]]]:
-        """For each row or column: its numbers, each with row and column, the best first."""
-        places: dict[int, list[tuple[float, int, int]]] = {}
+        """For each row or column: its numbers, each with row and column, the best first; without means that lack more
+        values than others."""
+        places: dict[int, list[tuple[int, float, int, int]]] = {}
         if self.best is None:
             return []
         for i, row in enumerate(self.rows):
@@ -203,8 +204,10 @@ class Table:
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
                 if isinstance(mean, float) and isfinite(mean) and not (names & UNRANKED or smooths(names)):
-                    places.setdefault(i if self.along == "row" else j, []).append((mean, i, j))
-        return [sorted(group, reverse=self.best == "max") for group in places.values()]
+                    lost = entry.lost if isinstance(entry, Interval) else 0
+                    places.setdefault(i if self.along == "row" else j, []).append((lost, mean, i, j))
+        whole = [[each for least, *each in group if least == min(group)[0]] for group in places.values()]
+        return [sorted(group, reverse=self.best == "max") for group in whole]
 
 
 def pivot(
@@ -250,13 +253,13 @@ def pivot(
     body = []
     for labels in sorted(of, key=smooths):
         matches = (of[labels].get(text) for text in titles)
-        ends = "mean", "low", "high", "n"
+        ends = "mean", "low", "high", "n", "missing"
         entries = (Interval(*(row[name] for name in ends)) if row and row["n"] else None for row in matches)
         body.append((*labels, *entries))
     gone = []
     for name, part in _by_method(summary[summary["missing"] > 0]):
-        egos = f"{part['missing'].max()} egos of {name} are left out"
-        gone.append(f"{egos} of {len(part)} means, as a run of theirs has no finite number.")
+        values = f"{part['missing'].max()} values of {name} are left out"
+        gone.append(f"{values} of {len(part)} means, as a run of an ego has no finite number.")
     if best and any(map(smooths, of)):
         gone.append("What knows later measurements, or draws random numbers anew, is not ranked.")
     made = Table(
@@ -371,6 +374,8 @@ def crossed(
         if any(entry is not None for entry in entries) or len(failures(results, where)):
             body.append((*labels, *entries))
     options["notes"] = (*options.get("notes", ()), *failed(results, *wheres), *lost(results))
+    if some := sum(isinstance(entry, Interval) and entry.lost > 0 for row in body for entry in row):
+        options["notes"] += (f"{some} means lack values of a run that has no finite number.",)
     return Table((*head, *columns), tuple(body), caption, **options) if body else None
 
 
@@ -393,5 +398,6 @@ def _columns(entry: Entry, wide: bool) -> list[object]:
 def _entry(stored: Any) -> Entry:
     """An entry as JSON has it: a mapping stands for an interval."""
     if isinstance(stored, dict):
-        return Interval(float(stored["mean"]), float(stored["low"]), float(stored["high"]), int(stored["n"]))
+        ends, counts = ("mean", "low", "high"), (int(stored["n"]), int(stored.get("lost", 0)))
+        return Interval(*(float(stored[end]) for end in ends), *counts)
     return stored if isinstance(stored, float | int | None) else str(stored)
