@@ -1,5 +1,6 @@
 """A graph of poses and landmarks as a Problem, and where to start it."""
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -37,6 +38,8 @@ MEASUREMENT_KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
+UNEVEN = 4.0
+"""Ratio of the variances of a position, by direction, from which one weight does not do."""
 Start = Literal["odometry", "file", "tree", "incremental", "auto"]
 
 
@@ -96,6 +99,9 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     if graph.dimension == 2 and (beyond := int((abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
         notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
+    size = np.linalg.eigvalsh(np.concatenate([_spread(graph, name) for name in MEASUREMENT_KINDS]))
+    if objective == "chordal" and (uneven := int((size[:, -1] > UNEVEN * size[:, 0]).sum())):
+        notes.append(f"one weight stands for noise that differs by direction, of {uneven} measurements: take geodesic")
     won = Search(first)
     if start == "auto":
         problem, won = _raced(graph, problem)
@@ -106,6 +112,12 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         notes.append("the start is the file's vertices, which may be the truth")
     search = won._replace(seconds=clock() - began, notes=(*notes, *won.notes), x0=problem.x0)
     return problem.replace_unchecked(search=search)
+
+
+def _spread(graph: Graph, name: str) -> Floats:
+    """(M, d, d) m^2, covariances of the positions of a kind of measurement."""
+    covariance: Floats = getattr(graph, name).covariance[:, : graph.dimension, : graph.dimension]
+    return covariance
 
 
 def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | None = None) -> tuple[Problem, Search]:
@@ -165,7 +177,7 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
     """Candidates for `solve_gnc`, (factor, rows): relative poses but those from one pose of a robot to its next.
 
     Args:
-        problem: of a graph; the first letter of a name is the robot.
+        problem: of a graph; names are a robot's, with a number behind it that grows with time.
 
     >>> from coopoc.optimize import pose
     >>> problem = Problem(("A0", "A1", "A2"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1, 2), fixed=(0,))
@@ -175,8 +187,8 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
     """
     instance("problem", problem, Problem)
     after, last = np.full(len(problem.names), -1), dict[str, int]()
-    for node in problem.poses:
-        robot = problem.names[node][0]
+    named = {node: re.split(r"(\d*)$", problem.names[node], maxsplit=1)[:2] for node in problem.poses}
+    for node, (robot, _) in sorted(named.items(), key=lambda each: int(each[1][1] or 0)):
         if robot in last:
             after[last[robot]] = node
         last[robot] = node

@@ -143,8 +143,9 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return unknown._replace(unobservable=nodes)
-    if entries.size <= DENSE_COLUMNS:
-        cov = _by_rows(problem, x, cov)
+    if entries.size <= DENSE_COLUMNS and (half := _by_rows(problem, x)) is not None:
+        free, rows, columns = entries.marginals
+        cov[free] = np.vecdot(half[rows], half[columns])
     if bent is None:
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):
@@ -175,9 +176,9 @@ def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]
     return cov, blocks[rows == columns]
 
 
-def _by_rows(problem: Problem, x: Floats, cov: Floats) -> Floats:
-    """Marginals (n, dof, dof) by R of J = Q R, rows of large numbers first and columns pivoted, which keeps digits that
-    J^T J rounds away; `cov` where J is singular.
+def _by_rows(problem: Problem, x: Floats) -> Floats | None:
+    """H (m, m) with H H^T = (J^T J)^-1 by R of J = Q R, rows of large numbers first and columns pivoted, which keeps
+    digits that J^T J rounds away; None where J is singular.
 
     References:
         Cox, Higham, Stability of Householder QR factorization for weighted least squares problems, 1998.
@@ -187,11 +188,8 @@ def _by_rows(problem: Problem, x: Floats, cov: Floats) -> Floats:
     J = as_stated(problem).whiten(x)[1].toarray()[:, problem.movable.ravel()]
     upper, pivot = qr(J[np.argsort(-abs(J).max(1))], mode="r", pivoting=True)
     own = abs(upper.diagonal())
-    if len(own) == J.shape[1] and own.min() > ROUNDED * own.max():
-        free, rows, columns = sparse(problem).entries.marginals
-        half = inv(upper[: len(own)])[np.argsort(pivot)]
-        cov[free] = np.vecdot(half[rows], half[columns])
-    return cov
+    singular = len(own) < J.shape[1] or own.min() <= ROUNDED * own.max()
+    return None if singular else np.asarray(inv(upper[: len(own)])[np.argsort(pivot)])
 
 
 def _symmetric(entries: Entries, values: Floats) -> Any:
@@ -402,7 +400,25 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
             whys += [f"constraints of {', '.join(equal)} that contradict the measurements"]
         cost = f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: "
         notes.append(cost + ", ".join([*whys, "outliers, or noise that is stated too small"]))
+    else:
+        notes += outlying(problem, x, truth.cost)
     return mean + spent, tuple(notes)
+
+
+def outlying(problem: Problem, x: Floats, cost: float) -> list[str]:
+    """A note on the worst measurement of each factor without a loss, if TAIL of all problems have one as bad."""
+    from scipy.special import gammaincc
+
+    every, notes = sum(len(factor.nodes) for factor in problem.factors), []
+    for factor in problem.factors if every * np.exp(-cost) < TAIL else ():  # else none is as bad
+        if factor.loss is None:
+            square = squared(problem, factor, x) / (1 + factor.twice)
+            tail = every * gammaincc(0.5 * np.maximum(factor.measured, 1), 0.5 * square)
+            k = tail.argmin()
+            if tail[k] < TAIL:
+                names = "-".join(problem.names[node] for node in factor.nodes[k])
+                notes.append(f"{factor.kind} {names} is {np.sqrt(square[k]):.3g} standard deviations off: an outlier?")
+    return notes
 
 
 def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float) -> str:
@@ -516,5 +532,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     wanted = system.entries.number[places].ravel()
     unit = (np.arange(system.size)[:, None] == wanted).astype(float)
     solved = columns_solved(system.cholesky, unit) if places else unit
+    if not truth.curved and system.size <= DENSE_COLUMNS and (half := _by_rows(problem, x)) is not None:
+        solved = half @ (half.T @ unit)
     whole = np.pad(solved, ((0, 1), (0, 0)))[wanted]  # the last row for what cannot move
     return whole.reshape(len(places), dof, len(places), dof).swapaxes(1, 2)

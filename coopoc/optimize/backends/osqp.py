@@ -61,6 +61,8 @@ def solver(
     >>> solve(problem.constrain("displacement", ("a", "b"), upper=[7, 9, 9]), "osqp").x.round(3)[:, 0]
     array([1., 8.])
     """
+    from osqp import OSQPException
+
     system, held = sparse(problem), bool(problem.constraints)
     programme = _programme(problem, system)
     if held:
@@ -75,7 +77,7 @@ def solver(
         sides = constraint_rows(problem, x).sides if held else (np.empty(0), np.empty(0))
         try:
             return programme.solve(values, gradient, *sides) if system.cholesky.factor(values) else None
-        except LinAlgError:
+        except (LinAlgError, OSQPException, ValueError):  # what it cannot factorise
             return None
 
     end = arrive(system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, held)
