@@ -27,7 +27,7 @@ from .starts.graph_starts import (
     position_variance,
     rotation_variance,
 )
-from .starts.initial import directed, graph_of
+from .starts.initial import crossed, directed, graph_of
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
@@ -149,7 +149,7 @@ def started(problem: Problem, end: Floats | None = None) -> Problem:
     began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
-        at = problem.starting_at(directed(problem, _x0(graph, problem.poses, "odometry")))
+        at = problem.starting_at(directed(problem, crossed(problem, _x0(graph, problem.poses, "odometry"))))
         at, won = _raced(graph, at, True, end)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 

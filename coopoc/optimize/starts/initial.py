@@ -21,6 +21,8 @@ from .graph_starts import parts, walk, with_points
 
 NUDGE_STD = 0.1
 """m or rad, standard deviation of such a move."""
+PARALLEL = 1e-6
+"""Sum of squared sines between bearings from which they cross."""
 RIDGE = 1e-13
 """Share of its information that every point has of where it is, above rounding: what nothing places stays there."""
 RIDGE_STEPS = 3
@@ -68,6 +70,25 @@ def directed(problem: Problem, x: Floats) -> Floats:
         nodes = np.unique(stacked(each.ravel() for each in lost))
         step[nodes] = NUDGE_STD * rng.normal(size=(len(nodes), movable.shape[1]))
         x = problem.space.retract(x, step * movable)
+    return x
+
+
+def crossed(problem: Problem, x: Floats) -> Floats:
+    """Nodes x (n, ambient) in the plane, with points of which only bearings are measured where these cross: with the
+    least sum of squared distances from their lines."""
+    seen = [factor for factor in problem.factors if factor.kind == "bearing" and problem.dimension == 2]
+    placed = [factor.nodes.ravel() for factor in problem.factors if factor not in seen]
+    squares, sums = np.zeros((len(x), 2, 2)), np.zeros((len(x), 2, 1))
+    for factor in seen:
+        i, j = factor.nodes.T
+        angle = to_orientation(problem.space.rotation(x[i]))[:, 0] + factor.z[:, 0]
+        across = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+        square = across[:, :, None] * across[:, None]
+        np.add.at(squares, j, square)
+        np.add.at(sums, j, square @ x[i, :2, None])
+    squares[stacked([*placed, *map(np.atleast_1d, (problem.poses, problem.fixed))]).astype(int)] = 0.0
+    known = np.linalg.eigvalsh(squares)[:, 0] > PARALLEL
+    x[known, :2] = np.linalg.solve(squares[known], sums[known])[..., 0]
     return x
 
 
