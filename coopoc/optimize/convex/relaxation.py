@@ -19,7 +19,7 @@ from numpy.linalg import eigh, eigvalsh
 from ...arrays import Bools, Floats
 from ...errors import InputError, said
 from ...text import short_repr
-from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
+from ..algebra.cholesky import Cholesky, cholesky_of
 from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve
@@ -73,7 +73,7 @@ class Reduced:
         """The constrained rows X and the free ones where the cost is smallest."""
         bound = self.problem.bound
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
-        return np.concatenate([X, columns_solved(self._inverse, right)])
+        return np.concatenate([X, self._inverse.solve(right)])
 
     def times(self, X: Floats) -> Floats:
         """C X."""

@@ -10,7 +10,7 @@ from numpy.linalg import norm, pinv, svd
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ...formats.graph import Graph, PointEdges, PoseEdges
-from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
+from ..algebra.cholesky import Cholesky, cholesky_of
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked, taken, unchecked
@@ -181,7 +181,7 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
     for _ in range(SWEEPS):
         if factored is None:
             return rotation
-        turned = nearest_rotation(columns_solved(factored, far * turned.mT.reshape(n * d, d)).reshape(n, d, d).mT)
+        turned = nearest_rotation(factored.solve(far * turned.mT.reshape(n * d, d)).reshape(n, d, d).mT)
     part = parts(n, edges.nodes)
     still = firsts(part, held)[part]
     return rotation[still] @ turned[still].mT @ turned
@@ -218,7 +218,7 @@ def averaging(
     def moves(error: Floats) -> Floats:
         if factored is None:
             return zeros((n, error.shape[1]))
-        return -columns_solved(factored, gap.T @ (weight[:, None] * error))
+        return -factored.solve(gap.T @ (weight[:, None] * error))
 
     return moves, factored
 
