@@ -7,7 +7,6 @@ from dataclasses import replace
 from math import inf, nan, sqrt
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -123,7 +122,18 @@ def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
     """The checkpoint of a job, trained now."""
     data = job_clients(job, fleet)
     made = _made(job, data, f"train {job.name}" if progress else None)
-    card = _card(job, fleet, data) | {"validation_m": errors_beside_fitted_filter(made.model, data)} | dict(made.card)
+    card = {
+        **job.card,
+        "key": job.key(fleet),
+        **({"noise": "measured"} if isinstance(fleet, MeasuredDrives) else {}),
+        "fleet": fleet.name,
+        "digest": fleet.digest,
+        "clients": [client.name for client in data],
+        "training_pieces": [len(client.training) for client in data],
+        "validation_pieces": [len(client.validation) for client in data],
+        "validation_m": errors_beside_fitted_filter(made.model, data),
+        **made.card,
+    }
     if card.get("best") == 0:
         rate = f"lower learning_rate={job.recipe.schedule.learning_rate:g}"
         card["warning"] = f"no weights validated better than those of the start, which are kept; {rate}"
@@ -156,19 +166,6 @@ def _key(path: Path) -> str:
         return str(read(path)[1].get("key"))
     except InputError:
         return "damaged"
-
-
-def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
-    return {
-        **job.card,
-        "key": job.key(fleet),
-        **({"noise": "measured"} if isinstance(fleet, MeasuredDrives) else {}),
-        "fleet": fleet.name,
-        "digest": fleet.digest,
-        "clients": [c.name for c in data],
-        "training_pieces": [len(c.training) for c in data],
-        "validation_pieces": [len(c.validation) for c in data],
-    }
 
 
 def _joined(data: Sequence[Client], part: str) -> Segments:
