@@ -208,9 +208,8 @@ def averaging(
     """
     from scipy.sparse import csr_array, diags_array
 
-    weight, row = 1.0 / variance, np.arange(len(nodes))
-    sign = np.repeat([-1.0, 1.0], len(nodes))
-    gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
+    weight, ends, m = 1.0 / variance, nodes.ravel(), len(nodes)
+    gap = csr_array((np.tile([-1.0, 1.0], m), ends, 2 * np.arange(m + 1)), shape=(m, n))
     pinned = zeros(n)  # of what may be shifted as a whole any weight holds a node where it is
     pinned[firsts(parts(n, nodes), held)] = weight.max(initial=1e-300)
     factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(pinned))
