@@ -7,7 +7,6 @@ from dataclasses import replace
 from math import inf, nan, sqrt
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -122,8 +121,19 @@ def _train(job: Job, fleet: Drives, out: Path, worst: float, progress: bool) -> 
 def trained(job: Job, fleet: Drives, progress: bool = True) -> Checkpoint:
     """The checkpoint of a job, trained now."""
     data = job_clients(job, fleet)
-    made = TRAINERS[job.recipe.kind](job, data, f"train {job.name}" if progress else None)
-    card = _card(job, fleet, data) | {"validation_m": errors_beside_fitted_filter(made.model, data)} | dict(made.card)
+    made = _made(job, data, f"train {job.name}" if progress else None)
+    card = {
+        **job.card,
+        "key": job.key(fleet),
+        **({"noise": "measured"} if isinstance(fleet, MeasuredDrives) else {}),
+        "fleet": fleet.name,
+        "digest": fleet.digest,
+        "clients": [client.name for client in data],
+        "training_pieces": [len(client.training) for client in data],
+        "validation_pieces": [len(client.validation) for client in data],
+        "validation_m": errors_beside_fitted_filter(made.model, data),
+        **made.card,
+    }
     if card.get("best") == 0:
         rate = f"lower learning_rate={job.recipe.schedule.learning_rate:g}"
         card["warning"] = f"no weights validated better than those of the start, which are kept; {rate}"
@@ -158,42 +168,21 @@ def _key(path: Path) -> str:
         return "damaged"
 
 
-def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
-    return {
-        **job.card,
-        "key": job.key(fleet),
-        **({"noise": "measured"} if isinstance(fleet, MeasuredDrives) else {}),
-        "fleet": fleet.name,
-        "digest": fleet.digest,
-        "clients": [c.name for c in data],
-        "training_pieces": [len(c.training) for c in data],
-        "validation_pieces": [len(c.validation) for c in data],
-    }
-
-
 def _joined(data: Sequence[Client], part: str) -> Segments:
     return Segments.join([getattr(c, part) for c in data])
 
 
-def _federated(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
-    plan = job.recipe.plan
-    how = plan.rounds, plan.aggregate, plan.local_epochs, job.setting.seed, plan.schedule, stage
-    done = federate(untrained(job), data, *how)
-    return Checkpoint(done.model, done.card, done.weights)
-
-
-def _fitted(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
+def _made(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
+    """The net, its weights along the way, and a card of how it was trained."""
+    recipe, seed = job.recipe, job.setting.seed
+    if recipe.kind == "federated":
+        how = recipe.rounds, recipe.aggregate, recipe.local_epochs, seed, recipe.schedule, stage
+        together = federate(untrained(job), data, *how)
+        return Checkpoint(together.model, together.card, together.weights)
     training, validation, long = (_joined(data, part) for part in ("training", "validation", "long"))
-    how = job.recipe.schedule, job.setting.seed, stage, long, str(job.client or "")
-    done = fit(untrained(job), training, validation, *how)
+    if recipe.kind == "okf":
+        return Checkpoint(*fit_okf(training, validation, recipe.schedule.epochs, stage))
+    done = fit(untrained(job), training, validation, recipe.schedule, seed, stage, long, str(job.client or ""))
     rows = [{name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in done.history]
     card = {"history": rows, "best": done.best.step, "stopped": done.stopped, "seconds": done.seconds}
     return Checkpoint(done.model, card, torch.stack([row.weights for row in done.history]))
-
-
-def _okf(job: Job, data: Sequence[Client], stage: str | None) -> Checkpoint:
-    parts = _joined(data, "training"), _joined(data, "validation")
-    return Checkpoint(*fit_okf(*parts, job.recipe.schedule.epochs, stage))
-
-
-TRAINERS = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

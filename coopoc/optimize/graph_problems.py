@@ -89,7 +89,13 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     first = "odometry" if start in ("auto", "incremental") else start
     start_x = _x0(graph, poses, first)
     problem = Problem(
-        graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=tuple(graph.fixed.tolist())
+        graph.names,
+        factors,
+        start_x,
+        dimension=graph.dimension,
+        poses=poses,
+        fixed=tuple(graph.fixed.tolist()),
+        search=Search(first),
     )
     problem = problem.starting_at(directed(problem, start_x))
     if len(graph.fixed) - len(given.fixed) > (not len(given.fixed)):
@@ -99,28 +105,23 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     if graph.dimension == 2 and (beyond := int((abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
         notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
-    size = np.linalg.eigvalsh(np.concatenate([_spread(graph, name) for name in MEASUREMENT_KINDS]))
+    d, each = graph.dimension, [getattr(graph, name).covariance for name in MEASUREMENT_KINDS]
+    size = np.linalg.eigvalsh(np.concatenate([covariance[:, :d, :d] for covariance in each]))
     if objective == "chordal" and (uneven := int((size[:, -1] > UNEVEN * size[:, 0]).sum())):
         notes.append(f"one weight stands for noise that differs by direction, of {uneven} measurements: take geodesic")
-    won = Search(first)
     if start == "auto":
-        problem, won = _raced(graph, problem)
+        problem = _raced(graph, problem)
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
-        problem, won = problem.starting_at(x0), Search(start, steps)
+        problem = problem.starting_at(x0).replace_unchecked(search=Search(start, steps))
+    won = problem.search
     if won.start.startswith("file") and not graph.guess:
         notes.append("the start is the file's vertices, which may be the truth")
     search = won._replace(seconds=clock() - began, notes=(*notes, *won.notes), x0=problem.x0)
     return problem.replace_unchecked(search=search)
 
 
-def _spread(graph: Graph, name: str) -> Floats:
-    """(M, d, d) m^2, covariances of the positions of a kind of measurement."""
-    covariance: Floats = getattr(graph, name).covariance[:, : graph.dimension, : graph.dimension]
-    return covariance
-
-
-def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | None = None) -> tuple[Problem, Search]:
+def _raced(graph: Graph, problem: Problem, draws: bool = False, end: Floats | None = None) -> Problem:
     """The race of what a graph offers; the problem starts at chained odometry."""
     starts: dict[str, Callable[[], Floats]] = {
         name: partial(_x0, graph, problem.poses, name) for name in contenders(graph)
@@ -146,12 +147,10 @@ def started(problem: Problem, end: Floats | None = None) -> Problem:
     """
     if not problem.poses or (problem.x0 is not None and end is None):
         return problem
-    began = clock()
     with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
         graph = graph_of(problem)
         at = problem.starting_at(directed(problem, crossed(problem, _x0(graph, problem.poses, "odometry"))))
-        at, won = _raced(graph, at, True, end)
-    return at.replace_unchecked(search=won._replace(seconds=clock() - began))
+        return _raced(graph, at, True, end)
 
 
 def _counted(notes: Sequence[str]) -> list[str]:

@@ -1,7 +1,7 @@
 """Live estimation: GTSAM's iSAM2 follows the measurements, and `solve` checks where it has led."""
 
 from collections import ChainMap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -116,9 +116,15 @@ class Incremental:
         if free := ", ".join(self._free(part, keys, x, points)[:5]):
             raise InputError("factors", f"leave {free} free", "must hold every new pose", "Add a relative pose.")
         graph, guess = graph_of(part, stated, keys), values(part.space, which_turn(part)[old:], x, *keys[old:][:1])
-        for key, place, information in self._vague(part, keys, x, points):
-            vague = gtsam.noiseModel.Isotropic.Precision(len(place), information)
-            graph.add(gtsam.__dict__[f"PriorFactorPoint{len(place)}"](key, place, vague))
+        if points:
+            at, d, dof = self._at(keys, x), part.dimension, part.space.dof
+            J = part.whiten(at)[1].tocsc()
+        for k in points:
+            own = J[:, k * dof : k * dof + d]
+            least, *_, most = np.linalg.eigvalsh(np.nan_to_num((own.T @ own).toarray())).tolist()
+            information = max(VAGUE * most * (least <= VAGUE * most), LOOSE**-2)
+            vague = gtsam.noiseModel.Isotropic.Precision(d, information)
+            graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](keys[k], at[k, :d], vague))
         used = [dict.fromkeys(keys, float(self._steps))] if self.lag else []
         for again in (False, True):
             count = self._graph().size()
@@ -131,18 +137,6 @@ class Incremental:
                     said = shown(" ".join(str(error).split()), 200)
                     raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
         self._steps += 1
-
-    def _vague(
-        self, part: Problem, keys: Sequence[int], x: Floats, points: list[int]
-    ) -> Iterator[tuple[int, Floats, float]]:
-        """Keys and places of the new points, and the information of their priors, 1/m^2."""
-        if points:
-            at, d, dof = self._at(keys, x), part.dimension, part.space.dof
-            J = part.whiten(at)[1].tocsc()
-        for k in points:
-            own = J[:, k * dof : k * dof + d]
-            least, *_, most = np.linalg.eigvalsh(np.nan_to_num((own.T @ own).toarray())).tolist()
-            yield keys[k], at[k, :d], max(VAGUE * most * (least <= VAGUE * most), LOOSE**-2)
 
     def _at(self, keys: Sequence[int], x: Floats) -> Floats:
         """(n, ambient) nodes with these keys, the last of which are new."""

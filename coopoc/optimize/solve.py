@@ -183,9 +183,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
 def _searched(problem: Problem, start: Floats, end: Floats | None, draws: bool) -> Problem:
     """A problem of points from where its converted measurements (n, d), multidimensional scaling, random starts, if it
     `draws`, or an x0, which led to the `end` (n, d), lead lowest."""
-    began, starts = clock(), {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
-    problem, won = race(problem, starts, {}, draws, end)
-    return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
+    return race(problem, {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}, {}, draws, end)
 
 
 def _drawn(
@@ -239,14 +237,14 @@ def _challenged(
         return problem, first
     if near:
         strange = any(f.measurement.frame == "nodes" and f.kind not in IMAGED for f in problem.factors)
-        other, won = race(problem, {}, {}, strange, x)
-        if not won.iterations:
+        other = race(problem, {}, {}, strange, x)
+        if not other.search.iterations:
             return problem, first
     else:
         astray = abs(x - np.asarray(problem.x0)).max() > ASTRAY_SHARE * np.ptp(x, axis=0).max()
         other = _measured(problem, x, not whole and (astray or not smooth(record)))
-        won = other.search
-    saved = cost - (least := system.cost(np.asarray(other.x0)))
+    least = system.cost(np.asarray(other.x0))
+    won, saved = other.search, cost - least
     if higher(cost, least) and (not near or saved > RIVAL_COST):
         won = won._replace(iterations=won.iterations + first.iterations)
         note = f"x0 leads to a higher minimum, of cost {cost:.4g}: start {won.start!r} led here"

@@ -58,7 +58,9 @@ class Cholesky:
         return np.square(self._factor[self._kernels.places(self._fronts, self._rank, self._rank)])
 
     def solve(self, rhs: Floats) -> Floats:
-        """(u,) A^-1 rhs."""
+        """A^-1 rhs, (u,) or (u, K), column by column."""
+        if rhs.ndim == 2:
+            return np.column_stack([*map(self.solve, rhs.T.copy())])
         return self._kernels.solved(self._fronts, self._factor, rhs)
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
@@ -89,11 +91,6 @@ def cholesky_of(matrix: Any, group: Ints | None = None) -> Cholesky | None:
         return None
     cholesky = Cholesky(upper.indptr, upper.indices, group)
     return cholesky if cholesky.factor(upper.data) else None
-
-
-def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
-    """(u, K) A^-1 right, column by column."""
-    return np.column_stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T])
 
 
 @lru_cache(maxsize=3)

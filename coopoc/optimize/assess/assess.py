@@ -10,7 +10,7 @@ from numpy.linalg import LinAlgError, eigh, norm, qr
 
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
-from ..algebra.cholesky import cholesky_of, columns_solved
+from ..algebra.cholesky import cholesky_of
 from ..algebra.sparse import Entries, layout_of, sparse, structure_of
 from ..model.derivatives import Model, linearise, numbers_of
 from ..model.factor import Factor, as_factor, reweighed, stacked, unchecked
@@ -219,7 +219,7 @@ def _marginals(J: Any, still: Bools, gradient: Floats, active: Active) -> tuple[
         raise LinAlgError("not positive definite")
     dx = onto - along @ free.solve(along.T @ (gradient + hessian @ onto))
     nodes = [exact[rows] for rows in np.arange(still.size).reshape(still.shape)]
-    cov = np.array([ways @ columns_solved(held, ways.T.toarray()) for ways in nodes])
+    cov = np.array([ways @ held.solve(ways.T.toarray()) for ways in nodes])
     own = (exact @ within[1] @ exact.T).diagonal()
     inflation = own * np.einsum("nii->ni", cov).ravel()
     sound = (own > 1e-13 * own.max(initial=0.0)) & (inflation > 0) & (inflation < INFLATION)
@@ -297,7 +297,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
         factored, shift = cholesky_of(square + diags_array(np.full(len(length), shift))), 10.0 * shift
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
-        ways = qr(columns_solved(factored, ways))[0]
+        ways = qr(factored.solve(ways))[0]
     ways = ways @ eigh(ways.T @ (square @ ways))[1]
     return np.asarray(ways[:, ~_seen(unit, ways)].T)
 
@@ -488,7 +488,7 @@ def _leverage(problem: Problem, x: Floats) -> float:
     turns = stacked(np.tile(f.twice & (np.arange(f.size) >= problem.dimension), len(f.nodes)) for f in problem.factors)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(turns), PROBES))
     probes = (linearised(problem, x)[1].T @ (turns[:, None] * signs))[problem.movable.ravel()]
-    return float(np.vdot(probes, columns_solved(sparse(problem).cholesky, probes)) / PROBES)
+    return float(np.vdot(probes, sparse(problem).cholesky.solve(probes)) / PROBES)
 
 
 def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str | int]) -> Floats:
@@ -531,7 +531,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
         raise InputError("problem", repr(problem), "must be observable", "Add measurements of solution.unobservable.")
     wanted = system.entries.number[places].ravel()
     unit = (np.arange(system.size)[:, None] == wanted).astype(float)
-    solved = columns_solved(system.cholesky, unit) if places else unit
+    solved = system.cholesky.solve(unit) if places else unit
     if not truth.curved and system.size <= DENSE_COLUMNS and (half := _by_rows(problem, x)) is not None:
         solved = half @ (half.T @ unit)
     whole = np.pad(solved, ((0, 1), (0, 0)))[wanted]  # the last row for what cannot move

@@ -94,12 +94,10 @@ def forms(problem: Problem) -> list[Form]:
 
 
 def _form(problem: Problem, factor: Factor) -> Form:
-    if factor.kind not in FORMS:
-        return None
     posed = which_turn(problem)
     kinds = {tuple([posed[i] for i in row]) for row in factor.nodes.tolist()}
     shared = factor.std is not None and len(factor.std) == 1
-    parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
+    parts = _parts(factor, factor.root[:1] if shared else factor.root, problem.dimension)
     if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
         return None
     return parts if all(row in part.names or row[::-1] in part.names for row in kinds for part in parts) else None
@@ -127,35 +125,40 @@ PLAIN: Mapping[str, Names] = {
 """GTSAM's classes of kinds whose residual is its error."""
 
 
-def _plain(factor: Factor, W: Floats, d: int) -> Form:
-    names = {turning: name.format(d) for turning, name in PLAIN[factor.kind].items()}
-    z = factor.z[:, 0] if factor.kind == "range" else factor.z
-    return [Part(names, zip(z, strict=True), W)]
-
-
-def _bearing(factor: Factor, W: Floats, d: int) -> Form:
-    """Of a bearing alone, or of range and bearing; GTSAM's order is the other, in which a diagonal W stays one.
-
-    In space GTSAM weighs a bearing by its tangent plane, not by azimuth and inclination, and has no forward axis.
-    """
+def _parts(factor: Factor, W: Floats, d: int) -> Form:
+    """The parts of a factor with W (M or 1, size, size); None of one that GTSAM weighs in another way."""
     import gtsam
 
-    if d == 3:
-        return None
-    name = "Bearing" if factor.kind == "bearing" else "BearingRange"
-    names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
-    return [Part(names, ((gtsam.Rot2(angle), *far) for *far, angle in factor.z), W[:, ::-1, ::-1])]
-
-
-def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
-    """GTSAM's chord T_j - T_i Z for the translation, its geodesic for the rotation alone."""
-    chord = None if _coupled(W, d) else _chord(W[:, :d, :d], factor.z, d)
-    if chord is None:
-        return None
-    size, first = (3, 2) if d == 2 else (6, 0)
-    root = np.zeros((len(W), size, size))
-    root[:, first : first + size - d, first : first + size - d] = W[:, d:, d:]
-    return [*chord, *_between("BetweenFactor", d, factor.z, root)]
+    z = factor.z
+    match factor.kind:
+        case "position" | "displacement" | "range":
+            names = {turning: name.format(d) for turning, name in PLAIN[factor.kind].items()}
+            return [Part(names, zip(z[:, 0] if factor.kind == "range" else z, strict=True), W)]
+        # in space it weighs a bearing by its tangent plane, not by azimuth and inclination, and has no forward axis
+        case "bearing" | "body_spherical" if d == 2:
+            name = "Bearing" if factor.kind == "bearing" else "BearingRange"
+            names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
+            # its order is the other, in which a diagonal W stays one
+            return [Part(names, ((gtsam.Rot2(angle), *far) for *far, angle in z), W[:, ::-1, ::-1])]
+        case "relative_position":
+            return _chord(W, Space(d, has_rotation=True).join(z), d)
+        case "relative_pose_chordal":
+            return _chord(W, z, d)
+        case "relative_pose_log":  # whose errors in space are those of the rotation first
+            return _between("BetweenFactor", d, z, W if d == 2 else np.roll(W, -d, axis=2))
+        case "relative_pose" if not _coupled(W, d) and (chord := _chord(W[:, :d, :d], z, d)):
+            size, first = (3, 2) if d == 2 else (6, 0)  # the geodesic for the rotation alone
+            root = np.zeros((len(W), size, size))
+            root[:, first : first + size - d, first : first + size - d] = W[:, d:, d:]
+            return [*chord, *_between("BetweenFactor", d, z, root)]
+        case "pose" if not _coupled(W, d):
+            moved = zip(z[:, :d], strict=True), W[:, :d, :d] @ Space(d, has_rotation=True).rotation(z).mT
+            turned = ((pose_of(d, each).rotation(),) for each in z), W[:, d:, d:]
+            return [
+                Part({(POSE,): f"PoseTranslationPrior{d}D"}, *moved),
+                Part({(POSE,): f"PoseRotationPrior{d}D"}, *turned),
+            ]
+    return None
 
 
 def _chord(W: Floats, z: Floats, d: int) -> Form:
@@ -179,34 +182,9 @@ def _chord(W: Floats, z: Floats, d: int) -> Form:
     return _between("FrobeniusBetweenFactor", d, z, np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1]))
 
 
-def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
-    if _coupled(W, d):
-        return None
-    root = W[:, :d, :d] @ Space(d, has_rotation=True).rotation(factor.z).mT
-    return [
-        Part({(POSE,): f"PoseTranslationPrior{d}D"}, zip(factor.z[:, :d], strict=True), root),
-        Part({(POSE,): f"PoseRotationPrior{d}D"}, ((pose_of(d, each).rotation(),) for each in factor.z), W[:, d:, d:]),
-    ]
-
-
 def _coupled(W: Floats, d: int) -> bool:
     """Whether position and rotation are correlated."""
     return bool(max(abs(W[:, :d, d:]).max(), abs(W[:, d:, :d]).max()) > WEIGHT_TOLERANCE * abs(W).max())
-
-
-FORMS = {
-    **dict.fromkeys(PLAIN, _plain),
-    "bearing": _bearing,
-    "body_spherical": _bearing,
-    "relative_position": lambda factor, W, d: _chord(W, Space(d, has_rotation=True).join(factor.z), d),
-    "relative_pose": _relative_pose,
-    "relative_pose_log": lambda factor, W, d: _between(  # whose errors in space are those of the rotation first
-        "BetweenFactor", d, factor.z, W if d == 2 else np.roll(W, -d, axis=2)
-    ),
-    "relative_pose_chordal": lambda factor, W, d: _chord(W, factor.z, d),
-    "pose": _pose_prior,
-}
-"""(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 
 
 def callbacks(problem: Problem, factors: Sequence[Factor]) -> Callable[[int, int, Sequence[int]], Any]:

@@ -162,7 +162,7 @@ def quadratic(problem: Problem) -> Quadratic:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if lacking := QUADRATIC.lacking(problem):
         hint = "Use least squares of ranges and chords, or trust the curvature that `solve` checks."
-        allowed = f"is not quadratic: it must be one of {sorted(TERMS)}, without losses and constraints"
+        allowed = f"is not quadratic: it must be one of {sorted(KINDS)}, without losses and constraints"
         raise InputError("problem", f"with {', '.join(lacking)}", allowed, hint)
     d, n = problem.dimension, len(problem.names)
     world = [f for f in problem.factors if f.kind in WORLD]
@@ -180,7 +180,7 @@ def quadratic(problem: Problem) -> Quadratic:
     each = iter(np.split(units.reshape(-1, q), np.cumsum([*map(len, ranges)])))
     rows = _Rows(columns, origin, frame, np.zeros((n, d), int), each, at.reshape(n, q))
     rows.rotation[poses] = turns.reshape(-1, d)
-    blocks = [block for factor in problem.factors for block in TERMS[factor.kind](rows, factor)]
+    blocks = [block for factor in problem.factors for block in _terms(rows, factor)]
     A = row_matrix(((np.concatenate(v, axis=2), np.concatenate(c, axis=1)) for v, c in blocks), sum(sizes))
     A.sum_duplicates()
     x = np.zeros((n, problem.space.ambient)) if problem.x0 is None else problem.x0
@@ -227,64 +227,41 @@ Blocks = list[tuple[list[Floats], list[Ints]]]
 """k rows of A per measurement: values (M, k, c) in columns (M, c), side by side."""
 
 
-def _position(rows: _Rows, factor: Factor) -> Blocks:
-    """W (t_i - z), or of a displacement W (t_j - t_i - z), z in the world's frame."""
-    z, q = factor.z if factor.kind == "displacement" else factor.z - rows.origin, rows.position.shape[1]
-    root = factor.root[:, :q, :q]
-    ends = [-root, root][2 - factor.nodes.shape[1] :]
-    values = [*ends, -root @ z.reshape(-1, q, rows.columns)]
-    return [(values, [*rows.position[factor.nodes.T], np.tile(rows.frame, (len(z), 1))])]
+def _terms(rows: _Rows, factor: Factor) -> Blocks:
+    """The rows of a factor of one of KINDS.
 
-
-def _range(rows: _Rows, factor: Factor) -> Blocks:
-    """w (t_j - t_i + r s)."""
-    root = factor.root * np.eye(rows.position.shape[1])
-    return [([-root, root, factor.z[..., None] * root], [*rows.position[factor.nodes.T], next(rows.units)])]
-
-
-def _pose(rows: _Rows, factor: Factor) -> Blocks:
-    """w (t_i - z), and w (R_i^T - R_z^T H)."""
-    (i,), d, frame = factor.nodes.T, len(rows.origin), np.tile(rows.frame, (len(factor.z), 1))
-    w, angular, turn = _weighed(factor, d)
-    return [
-        ([w, -w * (factor.z[:, None, :d] - rows.origin)], [rows.position[i], frame]),
-        ([angular * np.eye(d), -angular * turn], [rows.rotation[i], frame]),
-    ]
-
-
-def _relative(rows: _Rows, factor: Factor) -> Blocks:
-    """w (t_j - t_i - z R_i^T), as rows, and of a relative pose w (R_j^T - R_ij^T R_i^T)."""
-    (i, j), d = factor.nodes.T, len(rows.origin)
-    w, angular, turn = _weighed(factor, d)
-    blocks = [([-w, w, -w * factor.z[:, None, :d]], [rows.position[i], rows.position[j], rows.rotation[i]])]
-    if factor.measurement.compares_poses:
-        blocks.append(([-angular * turn, angular * np.eye(d)], [rows.rotation[i], rows.rotation[j]]))
+    Raises:
+        InputError: weights of axes that differ where a rotation acts.
+    """
+    nodes, z, root, d = factor.nodes.T, factor.z, factor.root, len(rows.origin)
+    at, q, frame = rows.position[nodes], rows.position.shape[1], np.tile(rows.frame, (len(z), 1))
+    if factor.kind == "range":  # w (t_j - t_i + r s)
+        root = root * np.eye(q)
+        return [([-root, root, z[..., None] * root], [*at, next(rows.units)])]
+    if factor.kind in ("position", "displacement"):  # W (t_i - z), or W (t_j - t_i - z), z in the world's frame
+        root = root[:, :q, :q]
+        ends, moved = ([root], z - rows.origin) if len(nodes) == 1 else ([-root, root], z)
+        return [([*ends, -root @ moved.reshape(-1, q, rows.columns)], [*at, frame])]
+    weight, turn = one_weight(root[:, :d, :d]), one_weight(root[:, d:, d:])
+    if weight is None or turn is None or root[:, :d, d:].any() or root[:, d:, :d].any():
+        _refuse(factor)
+    w, angular, turned = weight[:, None, None], turn[:, None, None], z[:, d:].reshape(-1, d, d).mT
+    if factor.kind == "pose_chordal":  # w (t_i - z), and w (R_i^T - R_z^T H)
+        moved, places = -w * (z[:, None, :d] - rows.origin), [*rows.rotation[nodes], frame]
+        return [([w, moved], [*at, frame]), ([angular * np.eye(d), -angular * turned], places)]
+    i, j = rows.rotation[nodes]
+    blocks = [([-w, w, -w * z[:, None, :d]], [*at, i])]  # w (t_j - t_i - z R_i^T)
+    if factor.measurement.compares_poses:  # and w (R_j^T - R_ij^T R_i^T)
+        blocks.append(([-angular * turned, angular * np.eye(d)], [i, j]))
     return blocks
 
 
-TERMS = {
-    "position": _position,
-    "displacement": _position,
-    "range": _range,
-    "relative_position": _relative,
-    "pose_chordal": _pose,
-    "relative_pose_chordal": _relative,
-}
+KINDS = ("position", "displacement", "range", "relative_position", "pose_chordal", "relative_pose_chordal")
 """Measurements of this form."""
-QUADRATIC = Capabilities(kinds=tuple(TERMS), losses=())
+QUADRATIC = Capabilities(kinds=KINDS, losses=())
 """What has this form."""
 WORLD = ("position", "displacement", "pose_chordal")
 """Measurements in the world's frame."""
-
-
-def _weighed(factor: Factor, d: int) -> tuple[Floats, Floats, Floats]:
-    """Weights (M, 1, 1) of the position and, if there is one, of the rotation, and R_z^T of that; InputError if either
-    is not one number."""
-    root = factor.root
-    position, turn = one_weight(root[:, :d, :d]), one_weight(root[:, d:, d:])
-    if position is None or turn is None or root[:, :d, d:].any() or root[:, d:, :d].any():
-        _refuse(factor)
-    return position[:, None, None], turn[:, None, None], factor.z[:, d:].reshape(-1, d, d).mT
 
 
 def one_weight(root: Floats) -> Floats | None:

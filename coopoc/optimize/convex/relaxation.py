@@ -19,7 +19,7 @@ from numpy.linalg import eigh, eigvalsh
 from ...arrays import Bools, Floats
 from ...errors import InputError, said
 from ...text import short_repr
-from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
+from ..algebra.cholesky import Cholesky, cholesky_of
 from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve
@@ -40,14 +40,14 @@ class Reduced:
     @cached_property
     def _kept(self) -> Bools:
         """False for the first position of each part that could be moved as a whole: it is fixed at zero."""
-        from scipy.sparse import csc_array
+        from scipy.sparse import eye_array
         from scipy.sparse.csgraph import connected_components
 
         bound, width = self.problem.bound, self.problem.sphere.shape[1]
         free = self.problem.rows[:, bound:].tocsc()
         part = connected_components(free.T @ free, directed=False)[1]
         _, first, label = np.unique(part * width + np.arange(len(part)) % width, return_index=True, return_inverse=True)
-        whole = csc_array((np.ones(len(label)), (np.arange(len(label)), label)), shape=(len(label), len(first)))
+        whole = eye_array(len(first), format="csr")[label]
         moved, terms = (abs(each).max(0).toarray().ravel() for each in (free @ whole, abs(free) @ whole))
         kept = np.ones(self.problem.rows.shape[1], bool)
         kept[bound + first[moved <= 1e-9 * terms]] = False
@@ -73,7 +73,7 @@ class Reduced:
         """The constrained rows X and the free ones where the cost is smallest."""
         bound = self.problem.bound
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
-        return np.concatenate([X, columns_solved(self._inverse, right)])
+        return np.concatenate([X, self._inverse.solve(right)])
 
     def times(self, X: Floats) -> Floats:
         """C X."""

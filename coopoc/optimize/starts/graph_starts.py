@@ -10,7 +10,7 @@ from numpy.linalg import norm, pinv, svd
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ...formats.graph import Graph, PointEdges, PoseEdges
-from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
+from ..algebra.cholesky import Cholesky, cholesky_of
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import stacked, taken, unchecked
@@ -181,7 +181,7 @@ def relaxed(graph: Graph, rotation: Floats, held: Sequence[int]) -> Floats:
     for _ in range(SWEEPS):
         if factored is None:
             return rotation
-        turned = nearest_rotation(columns_solved(factored, far * turned.mT.reshape(n * d, d)).reshape(n, d, d).mT)
+        turned = nearest_rotation(factored.solve(far * turned.mT.reshape(n * d, d)).reshape(n, d, d).mT)
     part = parts(n, edges.nodes)
     still = firsts(part, held)[part]
     return rotation[still] @ turned[still].mT @ turned
@@ -208,9 +208,8 @@ def averaging(
     """
     from scipy.sparse import csr_array, diags_array
 
-    weight, row = 1.0 / variance, np.arange(len(nodes))
-    sign = np.repeat([-1.0, 1.0], len(nodes))
-    gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
+    weight, ends, m = 1.0 / variance, nodes.ravel(), len(nodes)
+    gap = csr_array((np.tile([-1.0, 1.0], m), ends, 2 * np.arange(m + 1)), shape=(m, n))
     pinned = zeros(n)  # of what may be shifted as a whole any weight holds a node where it is
     pinned[firsts(parts(n, nodes), held)] = weight.max(initial=1e-300)
     factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(pinned))
@@ -218,7 +217,7 @@ def averaging(
     def moves(error: Floats) -> Floats:
         if factored is None:
             return zeros((n, error.shape[1]))
-        return -columns_solved(factored, gap.T @ (weight[:, None] * error))
+        return -factored.solve(gap.T @ (weight[:, None] * error))
 
     return moves, factored
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy import inf, pi
 
 from ...arrays import Floats, Ints
+from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
@@ -44,8 +45,8 @@ def race(
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     draws: bool,
     reached: Floats | None,
-) -> tuple[Problem, Search]:
-    """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
+) -> Problem:
+    """The problem from the start that leads lowest, its x0 where the steps from there have led, with the search.
 
     All starts are tried, and those whose costs are near the least go on. One start ends the race at once: its descent
     is `smooth`, its cost is within its chi-square bound, and a second start led there as smoothly, or there is nothing
@@ -61,7 +62,7 @@ def race(
         draws: whether points and bodies are started from random places, too.
         reached: (n, ambient) the end of the descent from an x0, which competes.
     """
-    system, taken, arrived = sparse(problem), 0, True
+    began, system, taken, arrived = clock(), sparse(problem), 0, True
     cost_of = system.cost
     tried = dict[str, tuple[float, Floats]]()
     straight, late = set(), dict(late)
@@ -96,7 +97,7 @@ def race(
         end = descend(x, LATER_STEPS)
         return end if arrived else np.full_like(end, np.nan)  # which is no minimum
 
-    def ended(name: str, x: Floats, sure: bool = False) -> tuple[Problem, Search]:
+    def ended(name: str, x: Floats, sure: bool = False) -> Problem:
         ends = list[tuple[float, Floats]]()
         if draws:
             x = descend(x, LATER_STEPS)
@@ -104,12 +105,12 @@ def race(
             name, x = (name if y is x else "drawn"), y
         x, moves, others = across(problem, x, landed, cost_of, not starts)
         if not (taken or starts):
-            return problem, Search(name)
+            return problem.replace_unchecked(search=Search(name))
         name, cost = name + ", moved" * (moves > 0), cost_of(x)
         costs = [each for each, _ in (*tried.values(), *ends[1:])] + [cost] * (moves > 0)
         ends += [*others, *((each, x) for each in minima)]
         notes = doubts(x, ends, cost_of) or (() if sure else reached_once(costs, cost))
-        return problem.starting_at(x), Search(name, taken, notes=notes)
+        return problem.starting_at(x).replace_unchecked(search=Search(name, taken, clock() - began, notes))
 
     if reached is not None:
         if not starts:
