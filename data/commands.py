@@ -12,7 +12,7 @@ from coopoc.arrays import one_of
 from coopoc.paths import replaceable, write
 
 from .fetch import Entry, fetch, public
-from .registry import DATASETS, LOGS, card, in_words, kind_of, list_datasets, load_fleet, read_log
+from .registry import DATASETS, LOGS, card, kind_of, list_datasets, load_fleet, read_log
 from .source import split
 
 
@@ -61,7 +61,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
         _print(name, _fields(public()[name]))
         return
     if name in DATASETS:
-        _print(name, in_words(card(name)))
+        _print(name, card(name)["words"])
         return
     if kind_of(name) in LOGS:
         log = read_log(name)

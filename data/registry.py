@@ -28,29 +28,13 @@ FLEETS = Path(__file__).parent / "fleets"
 
 
 def card(name: str) -> dict[str, Any]:
-    """The card of a bundled fleet: name, map, map_licence, command, sumo (version), recipe, and what `in_words` shows.
+    """The card of a bundled fleet: name, map, map_licence, command, sumo (version), recipe, statistics, and
+    `words`, these in texts.
 
     >>> card("town10")["neighbours"]["mean"] > 5
     True
     """
     return dict(json.loads((FLEETS / f"{name}.json").read_text("utf-8")))
-
-
-def in_words(facts: dict[str, Any]) -> dict[str, str]:
-    """Where a generated fleet comes from, its size and statistics, as texts."""
-    near, speed, height = facts["neighbours"], facts["speed"], facts["height"]
-    return {
-        "map": f"{facts['map']}, {facts['map_licence']}",
-        "made by": f"{facts['command']} (SUMO {facts['sumo']})",
-        "sha256": facts["sha256"],
-        "size": f"{facts['vehicles']} vehicles x {facts['steps']} steps of {facts['dt']:g} s",
-        "speed": f"{speed['min']:g}..{speed['max']:g} m/s, mean {speed['mean']:g}, standing {speed['standing']:.0%}",
-        **{f"speed of {k}": f"{low:g}..{high:g} m/s" for k, (low, high) in enumerate(facts.get("speeds", ()), 1)},
-        "neighbours": f"mean {near['mean']:g} within {near['radius']:g} m (cap {near['cap']:g}), some in "
-        f"{near['any']:.0%} of the steps",
-        "height": f"{height[0]:g}..{height[1]:g} m",
-        "acceleration": f"at most {facts['acceleration']:g} m/s^2",
-    }
 
 
 def bundled(name: str) -> Fleet:

@@ -127,8 +127,26 @@ def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -
     origin = {"name": recipe.name, "map": recipe.map, "map_licence": MAP_LICENCE, "command": command}
     settings = {"sumo": version("eclipse-sumo"), "recipe": asdict(recipe)}
     made = {**origin, **settings, **facts(fleet)}
+    made["words"] = in_words(made)
     (out / f"{recipe.name}.json").write_text(json.dumps(made, indent=1) + "\n")
     return made
+
+
+def in_words(facts: dict[str, Any]) -> dict[str, str]:
+    """Where a fleet comes from, its size and statistics, as texts."""
+    near, speed, height = facts["neighbours"], facts["speed"], facts["height"]
+    return {
+        "map": f"{facts['map']}, {facts['map_licence']}",
+        "made by": f"{facts['command']} (SUMO {facts['sumo']})",
+        "sha256": facts["sha256"],
+        "size": f"{facts['vehicles']} vehicles x {facts['steps']} steps of {facts['dt']:g} s",
+        "speed": f"{speed['min']:g}..{speed['max']:g} m/s, mean {speed['mean']:g}, standing {speed['standing']:.0%}",
+        **{f"speed of {k}": f"{low:g}..{high:g} m/s" for k, (low, high) in enumerate(facts.get("speeds", ()), 1)},
+        "neighbours": f"mean {near['mean']:g} within {near['radius']:g} m (cap {near['cap']:g}), some in "
+        f"{near['any']:.0%} of the steps",
+        "height": f"{height[0]:g}..{height[1]:g} m",
+        "acceleration": f"at most {facts['acceleration']:g} m/s^2",
+    }
 
 
 def facts(fleet: Fleet) -> dict[str, Any]:

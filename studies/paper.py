@@ -26,7 +26,7 @@ def paper(
         data: fleet to test on, a name or a path.
     """
     from coopoc import run_study
-    from coopoc.data.registry import DATASETS, card, in_words
+    from coopoc.data.registry import DATASETS, card
     from coopoc.study.report import report
     from coopoc.workers import say
 
@@ -42,7 +42,7 @@ def paper(
         out / "report.html",
         title="Should vehicles collaborate while they train, or while they decide?",
         lead=[LEAD.format(where=chosen)],
-        cards={name: in_words(card(name)) for name in bundled},
+        cards={name: card(name)["words"] for name in bundled},
     )
     took = f"{(perf_counter() - began) / 60:.1f} min"
     say(f"done in {took}, {failed} failed cells. The report is {page}")

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from test_data_generate import script
 
 from coopoc.data.fleet_files import write_table
-from coopoc.data.registry import DATASETS, FLEETS, card, detect, in_words, list_datasets, load_fleet
+from coopoc.data.registry import DATASETS, FLEETS, card, detect, list_datasets, load_fleet
 
 NAMES = ("town10", "town10-clients", "town10-validation", "town04")
 
@@ -58,7 +58,7 @@ def test_clients_have_the_papers_lengths_and_speeds():
     speed = norm(fleet.velocity, axis=2)
     ranges = np.c_[np.nanmin(speed, 0), np.nanmax(speed, 0)]
     np.testing.assert_allclose(ranges, [[8.9, 10.8], [9.2, 10.9], [0.7, 10.7], [3.6, 10.7]], atol=0.6)
-    words = in_words(card("town10-clients"))
+    words = card("town10-clients")["words"]
     assert [words[f"speed of {k}"] for k in (1, 4)] == ["8.6..10.9 m/s", "3..10.6 m/s"]
 
 

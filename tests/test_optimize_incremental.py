@@ -27,14 +27,14 @@ def our_pose(pose):
     return co.pose(pose.translation(), pose.theta())
 
 
-def followed(loss=None, lag=0):
+def followed(loss=None):
     """One step per pose."""
     moved, far = measured()
     start = co.Problem(("x0",), dimension=2, poses=(0,), x0=our_pose(TRUE[0])[None])
     often = gtsam.ISAM2Params()
     often.setRelinearizeThreshold(0.01)
     often.relinearizeSkip = 1
-    live = co.incremental(start.add("pose", "x0", our_pose(TRUE[0]), std=0.01), lag, often)
+    live = co.incremental(start.add("pose", "x0", our_pose(TRUE[0]), std=0.01), often)
     at = TRUE[0]
     for step, (k, mark, distance) in zip(moved, far, strict=True):
         at = at.compose(step)
@@ -100,9 +100,8 @@ def test_a_guess_has_no_weight(z, std):
     assert live.marginal("a").diagonal() == pytest.approx(std**2, rel=1e-6)
 
 
-@pytest.mark.parametrize("lag", [0, 8])
-def test_a_step_that_isam2_cannot_take_is_undone(lag, monkeypatch):
-    live, new = followed(lag=lag), {"x25": our_pose(TRUE[24])}
+def test_a_step_that_isam2_cannot_take_is_undone(monkeypatch):
+    live, new = followed(), {"x25": our_pose(TRUE[24])}
     live.add(values={"l9": [9.0, 0.0]})
     live.add([("range", ("x24", "l9"), 3.0, 0.1)])  # Cholesky takes a pivot for zero, and QR follows
     before, marginal = live["x24"], live.marginal("x24")
@@ -118,20 +117,6 @@ def test_robust_losses_are_those_of_a_solve():
     found = followed(Loss("huber", 1.0)).update()
     assert found.status.name == "SOLVED"
     assert found.extras["isam2_off"] < 0.05
-
-
-def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told():
-    live, (graph, best) = followed(lag=8), batch()
-    assert live["x24"][:2] == pytest.approx(best.atPose2(24).translation(), abs=0.02)
-    assert live["l0"][:2] == pytest.approx(best.atPoint2(100), abs=0.02)
-    assert np.trace(live.marginal("x24")) == pytest.approx(
-        np.trace(gtsam.Marginals(graph, best).marginalCovariance(24)), rel=0.05
-    )
-    assert len(live.isam.calculateEstimate().keys()) < 13
-    with refused("lag"):
-        live.update()
-    with refused("forgotten"):
-        live["x3"]
 
 
 def test_what_is_refused_leaves_the_estimate_as_it_was():

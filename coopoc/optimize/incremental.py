@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Floats, checked, instance, named, whole
+from ..arrays import Floats, checked, instance, named
 from ..errors import InputError, shown
 from .assess.assess import assess
 from .backends.gtsam import estimate, forms, graph_of, tangent, values, which_turn
@@ -31,16 +31,14 @@ class Incremental:
 
     Args:
         problem: at the beginning.
-        isam: the gtsam.ISAM2 behind it, or its IncrementalFixedLagSmoother; its keys are the indices of `names`.
-        lag: steps after which the latter forgets a node that no measurement uses any more, 0 for never.
+        isam: the gtsam.ISAM2 behind it; its keys are the indices of `names`.
 
     Attributes:
         names: of the nodes so far, in the order in which they came.
     """
 
-    def __init__(self, problem: Problem, isam: Any, lag: int) -> None:
+    def __init__(self, problem: Problem, isam: Any) -> None:
         self.names, self.isam, self._problem, self._factors = list(problem.names), isam, problem, list(problem.factors)
-        self.lag, self._steps = lag, 0
         self._place, self._poses = {name: k for k, name in enumerate(self.names)}, {*problem.poses}
         self._step(problem, range(len(self.names)), initial_guess(problem))
 
@@ -125,42 +123,35 @@ class Incremental:
             information = max(VAGUE * most * (least <= VAGUE * most), LOOSE**-2)
             vague = gtsam.noiseModel.Isotropic.Precision(d, information)
             graph.add(gtsam.__dict__[f"PriorFactorPoint{d}"](keys[k], at[k, :d], vague))
-        used = [dict.fromkeys(keys, float(self._steps))] if self.lag else []
         for again in (False, True):
-            count = self._graph().size()
+            count = self.isam.getFactorsUnsafe().size()
             try:
-                self.isam.update(graph, guess, *used)
+                self.isam.update(graph, guess)
                 break
             except RuntimeError as error:
                 self._restore(count, keys[old:])
                 if again:
                     said = shown(" ".join(str(error).split()), 200)
                     raise InputError("factors", said, "must be a step that iSAM2 can take", "Measure more.") from None
-        self._steps += 1
 
     def _at(self, keys: Sequence[int], x: Floats) -> Floats:
         """(n, ambient) nodes with these keys, the last of which are new."""
         return np.reshape([*map(self.__getitem__, keys[: len(keys) - len(x)]), *x], (len(keys), -1))
-
-    def _graph(self) -> Any:
-        return self.isam.getFactors() if self.lag else self.isam.getFactorsUnsafe()
 
     def _restore(self, count: int, new: Iterable[int]) -> None:
         """iSAM2 anew from its first `count` factors, without new nodes, by QR, which takes no small pivot for zero: a
         step that failed has left it between."""
         import gtsam
 
-        graph, old, guess = gtsam.NonlinearFactorGraph(), self._graph(), gtsam.Values(self.isam.getLinearizationPoint())
+        graph, old = gtsam.NonlinearFactorGraph(), self.isam.getFactorsUnsafe()
+        guess, params = gtsam.Values(self.isam.getLinearizationPoint()), self.isam.params()
         for k in filter(old.exists, range(count)):
             graph.add(old.at(k))
         for key in filter(guess.exists, new):
             guess.erase(key)
-        params, used = self.isam.params(), []
         params.setFactorization("QR")
-        if self.lag:
-            used = [{key: at for key, at in self.isam.timestamps().items() if guess.exists(key)}]
-        self.isam = gtsam.IncrementalFixedLagSmoother(self.lag, params) if self.lag else gtsam.ISAM2(params)
-        self.isam.update(graph, guess, *used)
+        self.isam = gtsam.ISAM2(params)
+        self.isam.update(graph, guess)
 
     def _free(self, part: Problem, keys: Sequence[int], x: Floats, points: list[int]) -> list[str]:
         """New poses that the factors of a step leave free where older nodes are known, and new points to LOOSE: only
@@ -186,9 +177,7 @@ class Incremental:
 
     @property
     def x(self) -> Floats:
-        """(n, ambient) iSAM2's estimate of all nodes; InputError with a lag."""
-        if self.lag:
-            raise InputError("lag", self.lag, "must be 0 for all nodes at once", "Read the late ones by name.")
+        """(n, ambient) iSAM2's estimate of all nodes."""
         posed = [k in self._poses for k in range(len(self.names))]
         return estimate(self._problem.space, posed, self.isam.calculateEstimate())
 
@@ -209,10 +198,7 @@ class Incremental:
         return np.asarray(turn @ self.isam.marginalCovariance(k) @ turn.T)
 
     def _index(self, node: str | int) -> int:
-        index = index_of(node, self._place, self.names)
-        if self.lag and not self.isam.getLinearizationPoint().exists(index):
-            raise InputError("node", node, f"is forgotten, {self.lag} steps after it was used", "Take a longer lag.")
-        return index
+        return index_of(node, self._place, self.names)
 
     @property
     def problem(self) -> Problem:
@@ -233,15 +219,13 @@ class Incremental:
         return replace(solution, extras=solution.extras | {"isam2_off": float(off)})
 
 
-def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Incremental:
+def incremental(problem: Problem, params: Any = None) -> Incremental:
     """A problem that grows live: GTSAM's iSAM2 takes a step with all that is added.
 
     Robust losses are those of `solve`; where GTSAM has no factor of a measurement, or with constraints, it is refused.
 
     Args:
         problem: the first nodes, with an x0 where there are poses.
-        lag: steps after which a node that is used no more is forgotten, its information kept (GTSAM's
-            IncrementalFixedLagSmoother); then there is no `update`. 0 for never.
         params: gtsam.ISAM2Params; None: GTSAM's own.
 
     References:
@@ -262,5 +246,4 @@ def incremental(problem: Problem, lag: int = 0, params: Any = None) -> Increment
         hint = "Leave them out, or solve() with them."
         raise InputError("problem", f"with {len(problem.constraints)} constraints", "must have none", hint)
     params = instance("params", gtsam.ISAM2Params() if params is None else params, gtsam.ISAM2Params)
-    whole("lag", lag, hint="0 forgets nothing.")
-    return Incremental(problem, gtsam.IncrementalFixedLagSmoother(lag, params) if lag else gtsam.ISAM2(params), lag)
+    return Incremental(problem, gtsam.ISAM2(params))
