@@ -22,7 +22,7 @@ MIN_COG_SPEED_M_S = 0.5
 
 
 def is_nmea(path: Path) -> bool:
-    """Whether a text begins with sentences of a receiver."""
+    """Whether a text begins with sentences of a receiver, whatever stands before them in the first lines."""
     with path.open("rb") as file:
         return bool(re.search(rb"\$..(GGA|RMC|GST),", file.read(2000)))
 

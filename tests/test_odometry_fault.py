@@ -29,6 +29,9 @@ FAULTS: dict[str, Callable[[Floats], Floats]] = {
 LOOK_ALIKE: dict[str, Callable[[Floats], Floats]] = {
     "a receiver jumps": lambda z: z + array([30.0, 0.0, 0.0]),
     "it is displaced at times": lambda z: z + 60.0 * (arange(z.shape[1]) % 100 < 30)[:, None, None],
+    "it leaps at times": lambda z: (
+        z + 20.0 * np.random.default_rng(0).normal(size=z.shape) * (arange(z.shape[1]) % 100 < 20)[:, None, None]
+    ),
     "it holds its fix": lambda z: where(arange(z.shape[1])[:, None, None] < 100, z[:, :1], z),
 }
 

@@ -55,6 +55,8 @@ def mean_interval(values: AnyArray) -> Interval:
 
     >>> mean_interval(np.ones((3, 5)))
     Interval(mean=1.0, low=1.0, high=1.0, n=15)
+    >>> print(mean_interval(np.array([1.0, 2.0])))  # 1.5 +- 12.7 / 2
+    1.5 [-4.85, 7.85]
     """
     values = _checked("values", values)
     mean, n = float(values.mean()), len(values) if len(values) > 1 else values.shape[1]

@@ -179,8 +179,8 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
         problem: of a graph; names are a robot's, with a number behind it that grows with time.
 
     >>> from coopoc.optimize import pose
-    >>> problem = Problem(("A0", "A1", "A2"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1, 2), fixed=(0,))
-    >>> pairs = [("A0", "A1"), ("A1", "A2"), ("A2", "A0")]
+    >>> problem = Problem(("A10", "A9", "A11"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1, 2), fixed=(0,))
+    >>> pairs = [("A9", "A10"), ("A10", "A11"), ("A11", "A9")]
     >>> loop_closures(problem.add("relative_pose", pairs, pose(np.zeros((3, 2))), std=[0.1, 0.1, 0.1]))
     [(0, [2])]
     """

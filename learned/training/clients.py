@@ -88,7 +88,12 @@ class Segments:
     @classmethod
     def join(cls, parts: "Sequence[Segments]") -> "Segments":
         """All pieces of several parts in their order; the parts agree in dt and start. Behind the end of shorter ones
-        there is neither a fix nor a truth."""
+        there is neither a fix nor a truth.
+
+        >>> each = [Segments(*torch.ones(3, 1, steps, 3), True, 0.1) for steps in (2, 4)]
+        >>> Segments.join(each).truth[0, :, 0], Segments.join(each).velocity[0, :, 0]
+        (tensor([1., 1., nan, nan]), tensor([1., 1., 0., 0.]))
+        """
         agreed, longest = {(p.dt, p.true_start) for p in parts}, max((p.truth.shape[1] for p in parts), default=0)
         if len(agreed) != 1:
             raise InputError("pieces", agreed, "must agree in dt and start", "Cut all clients alike.")

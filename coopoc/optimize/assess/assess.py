@@ -406,7 +406,12 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
 
 
 def outlying(problem: Problem, x: Floats, cost: float) -> list[str]:
-    """A note on the worst measurement of each factor without a loss, if TAIL of all problems have one as bad."""
+    """A note on the worst measurement of each factor without a loss, if TAIL of all problems have one as bad.
+
+    >>> line = Problem(("a",)).add("position", ["a"] * 1000, np.eye(1000, 3) * [8, 0, 0], std=1.0)
+    >>> outlying(line, np.zeros((1, 3)), 500.0)
+    ['position a is 8 standard deviations off: an outlier?']
+    """
     from scipy.special import gammaincc
 
     every, notes = sum(len(factor.nodes) for factor in problem.factors), []

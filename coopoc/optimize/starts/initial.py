@@ -75,7 +75,13 @@ def directed(problem: Problem, x: Floats) -> Floats:
 
 def crossed(problem: Problem, x: Floats) -> Floats:
     """Nodes x (n, ambient) in the plane, with points of which only bearings are measured where these cross: with the
-    least sum of squared distances from their lines."""
+    least sum of squared distances from their lines.
+
+    >>> seen = Problem(("a", "b", "mark"), dimension=2, poses=(0, 1))
+    >>> seen = seen.add("bearing", [("a", "mark"), ("b", "mark")], [[np.pi / 4], [3 * np.pi / 4]], std=0.1)
+    >>> crossed(seen, np.array([[0.0, 0, 1, 0, 0, 1], [2, 0, 1, 0, 0, 1], [9, 9, 1, 0, 0, 1]]))[2, :2].round(6)
+    array([1., 1.])
+    """
     seen = [factor for factor in problem.factors if factor.kind == "bearing" and problem.dimension == 2]
     placed = [factor.nodes.ravel() for factor in problem.factors if factor not in seen]
     squares, sums = np.zeros((len(x), 2, 2)), np.zeros((len(x), 2, 1))
