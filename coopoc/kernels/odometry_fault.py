@@ -3,8 +3,8 @@
 Two filters follow a vehicle on the ground, beside the one that wants its motion. One believes the odometry, the other
 adds a velocity error b, a random walk. By how much likelier the second makes a fix is evidence, which adds up. Either
 begins anew at a fix that is far beyond it: a receiver that jumps, and stays displaced, moves as the odometry says.
-Where the second does so once more while there is evidence, it is fixes that leap, and evidence is lost. From DECISIVE
-on, if b is more than heading and scale err by, motions are corrected by b, until no evidence is left.
+Where the second does so once more while there is evidence, fixes leap rather than the odometry, and evidence is lost.
+From DECISIVE on, if b is more than heading and scale err by, motions are corrected by b, until no evidence is left.
 
 This is done for each of two PACES of the random walk. The slow one finds errors of a twentieth of the way that last;
 the fast one those that are large, and begin and change at once.
@@ -34,12 +34,12 @@ WAY, SINCE, FIX, GAPS, TIMES, WEIGHT, FINEST, LIKELY, BASE, RATIO, FLOOR, INTERV
 """Since then: the way by odometry m, the time s; the last fix m, weighted sums of how far fixes were from the position
 and the way m, and of their times s, and of the weights, 1 / variance m^-2; the largest weight of late fixes; the
 logarithm of how likely they were; and, all the time, the numbers of a MotionNoise, base and ratio squared."""
-WALK, ANEW, SHARE, RATE, STDS, DURATION, AGAIN, SIZE = range(34, 42)
+WALK, FIRST, LATER, SHARE, RATE, STDS, DURATION, AGAIN, SIZE = range(34, 43)
 """The numbers of a pace; and 1 once the second filter has begun anew while there is evidence."""
-PACES = ((0.001, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 18.0, 0.2, 0.5, 5.0, 2.0))
+PACES = ((0.001, 6.0, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 18.0, 0.2, 0.5, 5.0, 2.0))
 """Of the random walks of b: the density of its acceleration m^2/s^3; the evidence that its filter loses where it begins
-anew once more; and the least error of an odometry that fails, as a share of the way, in m for each second, and in
-standard deviations of a fix, MAX_WANDER_M at most, and for how many s it lasts."""
+anew, and where it does so once more; and the least error of an odometry that fails, as a share of the way, in m for
+each second, and in standard deviations of a fix, MAX_WANDER_M at most, and for how many s it lasts."""
 AVERAGED_FIXES_S = 0.4
 """s, interval whose fixes are averaged into one."""
 RESTART_Q, MAX_Q = 14.0, 25.0
@@ -198,8 +198,9 @@ def gather_evidence(state: Floats, dt: float) -> None:
     state[LASTS] += time
     state[PATH] += time * sqrt(speed2)
     more = 0.5 * (min(believed, MAX_Q) - min(square, MAX_Q)) + log(wide / s)
-    more -= state[ANEW] if anew and state[AGAIN] > 0.0 else 0.0
-    state[AGAIN] = 1.0 if anew else state[AGAIN]
+    if anew:
+        more -= state[LATER] if state[AGAIN] > 0.0 else state[FIRST]
+        state[AGAIN] = 1.0
     too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > state[RATE] ** 2
     state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MAX_EVIDENCE)
     if state[EVIDENCE] == 0.0:
