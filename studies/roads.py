@@ -85,7 +85,8 @@ def thinned(task: str, data: Path | None) -> tuple[Recording, Fleet]:
 
 
 def road_row(task: str, data: Path | None, made: Method) -> Row:
-    """Error of the last 60 % of a drive, or of all of published ones.
+    """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
+    vehicle, NEES of (x, y), us of a step: of the last 60 % of a drive, or of all of published ones.
 
     Args:
         task: that is run.
@@ -97,13 +98,6 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
     files = [located(data, name) for name in roads(data)[task]] or [Path(split(str(data))[0])]
-    scored = _scored(made, recording, truth, start)
-    return {"task": task, "data": hashed(*files), **scored, "received_bytes_per_second": 0}
-
-
-def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> Row:
-    """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
-    vehicle, NEES of (x, y), us of a step."""
     blocks, ratios, seconds, axis = [], [], 0.0, {}
     size = min(BLOCK_SECONDS / recording.dt, (len(recording.t) - start) / MIN_BLOCKS)
     for column in recording.observers:
@@ -111,16 +105,18 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
         for begin, stop in recording.stretches(column):
             if stop <= start:
                 continue
-            track = method(recording.between(begin, stop), [column])
+            track = made(recording.between(begin, stop), [column])
             gap, nees = planar(track, truth.between(begin, stop))
             squares[begin:stop], seconds = np.square(gap[0, :, 0]).sum(-1), seconds + track.seconds
             ratios.append(nees[0, max(start - begin, 0) :, 0])
         blocks += blocks_of(np.sqrt(squares)[:, None], start, size).ravel().tolist()
         axis[recording.ids[column]] = round(float(np.sqrt(np.nanmean(squares[start:]) / 2)), 4)
-    row = {"rt_le_m": rounded(np.array(blocks)), "axis_rms_m": axis, "blocks_m": np.round(blocks, 4).tolist()}
+    row: Row = {"task": task, "data": hashed(*files), "rt_le_m": rounded(np.array(blocks)), "axis_rms_m": axis}
+    row["blocks_m"] = np.round(blocks, 4).tolist()
     if np.isfinite(nees := np.concatenate(ratios)).any():
         row["nees"] = round(np.nanmean(nees), 2)
-    return row | {"microseconds_per_step": round(1e6 * seconds / len(recording.t), 2)}
+    step = round(1e6 * seconds / len(recording.t), 2)
+    return row | {"microseconds_per_step": step, "received_bytes_per_second": 0}
 
 
 CONVOYS = {f"convoy-{road}": road for road in ROADS}

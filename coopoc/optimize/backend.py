@@ -99,10 +99,11 @@ class Backend:
             if name not in allowed:
                 hint = suggestion(name, allowed, "Leave it out.")
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
-        most, tolerance = options.get("max_iterations", MAX_ITERATIONS), options.get("tolerance", SOLVER_STEP_TOLERANCE)
-        if options:
-            whole("max_iterations", most, hint="Leave it out for 500.")
-            number("tolerance", tolerance, TINY, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
+        if "max_iterations" in options:
+            whole("max_iterations", options["max_iterations"], hint="Leave it out for 500.")
+        if "tolerance" in options:
+            hint = "Leave it out for 1e-8."
+            number("tolerance", options["tolerance"], TINY, allowed="a number > 0 (m)", hint=hint)
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"

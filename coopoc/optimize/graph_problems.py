@@ -20,7 +20,6 @@ from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import (
     STARTS,
-    anchors,
     contenders,
     incremental_start,
     parts,
@@ -167,8 +166,7 @@ def _counted(notes: Sequence[str]) -> list[str]:
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
     """(n, ambient) of a start that needs no search."""
-    x0, still = STARTS[name](graph), anchors(graph)
-    x0[still] = Space(graph.dimension, has_rotation=True).join(graph.position[still], graph.rotation[still])
+    x0 = STARTS[name](graph)
     return x0 if poses else x0[:, : graph.dimension]
 
 

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -182,16 +182,12 @@ def _cuts(drives: MeasuredDrives, column: int, piece: int, start: Start) -> Iter
     for run, fixes in enumerate(np.isfinite(drives.recording.gnss[:, :, column, 0])):
         starts = fixes & there if start == "true" else fixes
         for first, stop in drives.recording.stretches(column, piece + 1):
-            at = first
-            while (at := _next(starts, at)) + piece < stop:
-                if there[at + 1 : at + piece + 1].any():
-                    yield run, at
-                at += piece + 1
-
-
-def _next(true: Any, at: int) -> int:
-    """First step from `at` on where it is true, else one beyond the end."""
-    return at + int(np.argmax(true[at:])) if true[at:].any() else len(true)
+            free = first
+            for at in (first + np.flatnonzero(starts[first : stop - piece])).tolist():
+                if at >= free:
+                    free = at + piece + 1
+                    if there[at + 1 : free].any():
+                        yield run, at
 
 
 def _segments(drives: MeasuredDrives, column: int, cuts: Sequence[Cut], piece: int, start: Start) -> Segments:

@@ -90,17 +90,15 @@ Form = list[Part] | None
 
 def forms(problem: Problem) -> list[Form]:
     """Of each factor of a problem its parts in GTSAM."""
-    return [_form(problem, factor) for factor in problem.factors]
-
-
-def _form(problem: Problem, factor: Factor) -> Form:
-    posed = which_turn(problem)
-    kinds = {tuple([posed[i] for i in row]) for row in factor.nodes.tolist()}
-    shared = factor.std is not None and len(factor.std) == 1
-    parts = _parts(factor, factor.root[:1] if shared else factor.root, problem.dimension)
-    if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
-        return None
-    return parts if all(row in part.names or row[::-1] in part.names for row in kinds for part in parts) else None
+    posed, made = which_turn(problem), list[Form]()
+    for factor in problem.factors:
+        kinds = {tuple([posed[i] for i in row]) for row in factor.nodes.tolist()}
+        shared = factor.std is not None and len(factor.std) == 1
+        parts = _parts(factor, factor.root[:1] if shared else factor.root, problem.dimension) or []
+        known = all(row in part.names or row[::-1] in part.names for row in kinds for part in parts)
+        joined = len(parts) > 1 and factor.loss is not None  # by no robust loss of GTSAM's
+        made.append(parts if parts and known and not joined else None)
+    return made
 
 
 def pose_of(d: int, x: Floats) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from ...arrays import Floats
-from ..algebra.sparse import Sparse, sparse
+from ..algebra.sparse import sparse
 from ..assess.active import constraint_rows
 from ..backend import MAX_ITERATIONS, SOLVER_STEP_TOLERANCE, Backend, Capabilities, SolverResult
 from ..descent.levenberg_marquardt import arrive
@@ -62,16 +62,21 @@ def solver(
     array([1., 8.])
     """
     from osqp import OSQPException
+    from scipy.sparse import csc_matrix
 
     system, held = sparse(problem), bool(problem.constraints)
-    programme = _programme(problem, system)
+    entries = system.entries
+    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    matrix = csc_matrix((0, entries.size))
     if held:
+        matrix = csc_matrix(constraint_rows(problem, x).matrix)[:, problem.movable.ravel()]
         try:
             x, feasible = _nearest(problem, x)
         except LinAlgError:
             return SolverResult(x, 0)
         if not feasible:
             return SolverResult(x, 0, True)
+    programme = Programme(pattern, matrix)
 
     def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
         sides = constraint_rows(problem, x).sides if held else (np.empty(0), np.empty(0))
@@ -144,19 +149,6 @@ class Programme:
             return False
         met = np.where(y > weak, upper, np.where(y < -weak, lower, np.clip(value, lower, upper)))
         return bool((abs(value - met) <= BOUND_TOLERANCE).all())
-
-
-def _programme(problem: Problem, system: Sparse) -> Programme:
-    """The programme of a problem with its constraints, which are linear."""
-    from scipy.sparse import csc_matrix
-
-    entries = system.entries
-    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
-    matrix = csc_matrix((0, entries.size))
-    if problem.constraints:
-        rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
-        matrix = csc_matrix(rows.matrix)[:, entries.number.ravel() >= 0]
-    return Programme(pattern, matrix)
 
 
 def _nearest(problem: Problem, x: Floats) -> tuple[Floats, bool]:

@@ -12,8 +12,6 @@ displacement weighs its axes differently the columns are stacked into one, X = [
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -107,8 +105,7 @@ class Quadratic(NamedTuple):
         return out
 
 
-@dataclass(frozen=True, eq=False)
-class Multipliers:
+class Multipliers(NamedTuple):
     """Of the constraints of `problem`: stiefel (n, k, k) symmetric, sphere (m,)."""
 
     problem: Quadratic
@@ -120,7 +117,7 @@ class Multipliers:
         """1/2 trace is a lower bound if C - L is positive semidefinite."""
         return float(np.einsum("nii->", self.stiefel) + self.sphere.sum())
 
-    @cached_property
+    @property
     def matrix(self) -> Any:
         """L (bound, bound), sparse."""
         from scipy.sparse import block_diag

@@ -154,7 +154,10 @@ def arrive(
                 mu = _grown(mu)
                 continue
             x = there
-            mu = _next(mu, gain)
+            if gain > 0.75:
+                mu = mu / DECAY if mu > LEAST_DAMPING else 0.0
+            elif gain < 0.25:
+                mu = _grown(mu)
             if smooth and abs(gain - 1.0) >= NONQUADRATIC:
                 break
             if model == "gauss-newton":
@@ -168,12 +171,6 @@ def arrive(
 
 def _grown(mu: float) -> float:
     return GROWTH * mu if mu > 0.0 else FIRST_DAMPING
-
-
-def _next(mu: float, gain: float) -> float:
-    if gain > 0.75:
-        return mu / DECAY if mu > LEAST_DAMPING else 0.0
-    return _grown(mu) if gain < 0.25 else mu
 
 
 DELAY = 2.0

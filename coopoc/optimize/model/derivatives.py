@@ -285,9 +285,12 @@ def write(kind: Kind, model: Model) -> Written:
 
 def _tape(function: Any, name: str) -> "Tape":
     """The operations of a CasADi function of one vector."""
+    import casadi as ca
+
     from ...kernels.graphs.graph_tape import Operation, Tape
 
-    operations, count = _operations(), function.n_instructions()
+    operations, count = {getattr(ca, f"OP_{each.name}"): each for each in Operation}, function.n_instructions()
+    operations |= {ca.OP_SQ: Operation.MUL, ca.OP_TWICE: Operation.ADD}  # of one slot, which is read twice
     code, operands, value = np.zeros(count, int), np.zeros((count, 3), int), np.zeros(count)
     for k in range(count):
         instruction = function.instruction_id(k)
@@ -305,17 +308,6 @@ def _tape(function: Any, name: str) -> "Tape":
         else:
             operands[k] = written[0], read[0], read[-1]
     return Tape(code, operands, value, function.sz_w())
-
-
-@lru_cache(maxsize=1)
-def _operations() -> dict[int, Any]:
-    """CasADi's number of an operation -> ours."""
-    import casadi as ca
-
-    from ...kernels.graphs.graph_tape import Operation
-
-    twice = {ca.OP_SQ: Operation.MUL, ca.OP_TWICE: Operation.ADD}  # of one slot, which is read twice
-    return {getattr(ca, f"OP_{operation.name}"): operation for operation in Operation} | twice
 
 
 class Linear(NamedTuple):
