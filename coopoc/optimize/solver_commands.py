@@ -110,7 +110,9 @@ def described(solution: Solution) -> dict[str, Any]:
     row: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
     row |= {name: getattr(solution, name) for name in named}
     row |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}
-    return row | {key: solution.extras[key] for key in ("rejected",) if key in solution.extras}
+    if "rejected" in solution.extras:
+        row["rejected"] = solution.extras["rejected"]
+    return row
 
 
 def nodes(solution: Solution) -> dict[str, Any]:

@@ -117,9 +117,8 @@ def tables(folder: str | Path, form: str = "markdown", name: str | None = None) 
         InputError: as `views`, or an unknown name or format.
     """
     shown = {view["name"]: view for view in views(folder)["tables"]}
-    if name is not None:
-        one_of("table", name, shown)
-    return [Table.from_data(shown[n].get("table")).render(form) for n in (shown if name is None else [name])]
+    wanted = shown if name is None else [one_of("table", name, shown)]
+    return [Table.from_data(shown[one].get("table")).render(form) for one in wanted]
 
 
 def _data(value: Any) -> Any:

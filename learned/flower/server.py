@@ -129,7 +129,7 @@ def rounds(
     from flwr.app import Array, ArrayRecord
 
     (theta,) = flatten([untrained(job)])
-    one_of("aggregate", job.recipe.aggregate, tuple(STRATEGIES))
+    one_of("aggregate", job.recipe.aggregate, STRATEGIES)
     job.recipe.plan.check(nodes)
     strategy, until = _strategy(job.recipe.aggregate, theta, keep, names), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:

@@ -94,12 +94,10 @@ def fit(
     """
     check_net(model)
     instance("schedule", schedule, Schedule)
-    for field, value in {
-        "training": training,
-        "validation": validation,
-        "long": validation if long is None else long,
-    }.items():
-        check_segments(field, value)
+    check_segments("training", training)
+    check_segments("validation", validation)
+    if long is not None:
+        check_segments("long", long)
     began, theta, draw = perf_counter(), flatten([model]), stream(seed, "batches", 0, name)
     plan, judge = schedule.plan(len(training), draw), Judge([[validation], *([] if long is None else [[long]])], model)
     history, so_far = [Progress(0, theta[0].clone(), nan, float(judge(theta)))], []
@@ -217,20 +215,19 @@ def fit_okf(
     adam = torch.optim.Adam([logs], lr=0.1)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
     best, history = logs.detach().clone(), list[float]()
+
+    def loss(batch: Batch, share: Tensor) -> Tensor:
+        return (like.losses(logs, batch) * share).sum(1)
+
     for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
-                validated = float(_loss(like, logs, *judge))
+                validated = float(loss(*judge))
             best = logs.detach().clone() if validated < min(history, default=inf) else best
             history.append(validated)
         adam.zero_grad()
-        _loss(like, logs, *data).backward()
+        loss(*data).backward()
         adam.step()
         fall.step()
     made = like.with_logs(best.view(3, 3)).calibrate([training])
     return made, {"validation_loss": tuple(history), "seconds": perf_counter() - began}
-
-
-def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
-    """(1,) mean over pieces and time of the squared error, m^2."""
-    return (like.losses(logs, batch) * weight).sum(1)
