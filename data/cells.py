@@ -20,7 +20,7 @@ from coopoc.arrays import Bools, Floats, named, number, one_of
 from coopoc.errors import InputError, said, suggestion, unknown
 from coopoc.formats.values import MAX_NUMBER
 
-TABLES = (".csv", ".parquet", ".jsonl")
+TABLES = (".csv", ".parquet")
 Names = Mapping[str, str]
 """Name here -> name in a file; of kinds the other way round."""
 Factors = Mapping[str, float]
@@ -60,7 +60,7 @@ LARGEST_TABLE = 2**27
 
 
 def read_frame(path: Path, *text: str) -> DataFrame:
-    """Table of a .parquet, .jsonl (an object per line) or (any other ending) CSV file.
+    """Table of a .parquet or (any other ending) CSV file.
 
     Args:
         path: of the file; CSV between commas, or between semicolons or tabs with decimal commas.
@@ -70,10 +70,7 @@ def read_frame(path: Path, *text: str) -> DataFrame:
         InputError: a damaged file, one column, no header, two columns of one name, or a row longer than the header.
     """
     try:
-        if path.suffix.lower() == ".jsonl":
-            frame = pd.read_json(path, lines=True, dtype=False, convert_dates=False, precise_float=True)
-        else:
-            frame = _read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, text)
+        frame = _read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
@@ -155,9 +152,10 @@ def headers(path: Path) -> list[str]:
         if path.suffix.lower() == ".parquet":
             from pyarrow.parquet import read_schema
 
-            return [_plain(name) or UNNAMED for name in read_schema(path).names]
-        csv_file = path.suffix.lower() == ".csv"
-        return [_plain(name) or UNNAMED for name in (_first_lines(path)[1] if csv_file else read_frame(path))]
+            names = read_schema(path).names
+        else:
+            names = _first_lines(path)[1]
+        return [_plain(name) or UNNAMED for name in names]
     except Exception:  # of Arrow and csv
         return []
 

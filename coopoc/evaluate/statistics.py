@@ -1,6 +1,6 @@
 """Paired intervals: bootstrap over egos, then runs; training seeds apart."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from math import isfinite, nan
 
@@ -32,7 +32,7 @@ class Interval:
     low: float
     high: float
     n: int
-    lost: int = field(default=0, repr=False)
+    lost: int = 0
 
     def __str__(self) -> str:
         return f"{self.mean:.3g}" + (f" [{self.low:.3g}, {self.high:.3g}]" if isfinite(self.low) else "")
@@ -54,7 +54,7 @@ def mean_interval(values: AnyArray) -> Interval:
         InputError: a value that is not finite, another shape, or no value.
 
     >>> mean_interval(np.ones((3, 5)))
-    Interval(mean=1.0, low=1.0, high=1.0, n=15)
+    Interval(mean=1.0, low=1.0, high=1.0, n=15, lost=0)
     >>> print(mean_interval(np.array([1.0, 2.0])))  # 1.5 +- 12.7 / 2
     1.5 [-4.85, 7.85]
     """

@@ -104,8 +104,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     if graph.dimension == 2 and (beyond := int((abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
         notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
-    d, each = graph.dimension, [getattr(graph, name).covariance for name in MEASUREMENT_KINDS]
-    size = np.linalg.eigvalsh(np.concatenate([covariance[:, :d, :d] for covariance in each]))
+    d, kinds = graph.dimension, MEASUREMENT_KINDS
+    size = np.linalg.eigvalsh(np.concatenate([getattr(graph, kind).covariance[:, :d, :d] for kind in kinds]))
     if objective == "chordal" and (uneven := int((size[:, -1] > UNEVEN * size[:, 0]).sum())):
         notes.append(f"one weight stands for noise that differs by direction, of {uneven} measurements: take geodesic")
     if start == "auto":

@@ -373,9 +373,9 @@ def crossed(
         entries = [number(results, where) for number in columns.values()]
         if any(entry is not None for entry in entries) or len(failures(results, where)):
             body.append((*labels, *entries))
-    options["notes"] = (*options.get("notes", ()), *failed(results, *wheres), *lost(results))
-    if some := sum(isinstance(entry, Interval) and entry.lost > 0 for row in body for entry in row):
-        options["notes"] += (f"{some} means lack values of a run that has no finite number.",)
+    some = sum(getattr(entry, "lost", 0) > 0 for row in body for entry in row)
+    gone = [f"{some} means lack values of a run that has no finite number."] * bool(some)
+    options["notes"] = (*options.get("notes", ()), *gone, *failed(results, *wheres), *lost(results))
     return Table((*head, *columns), tuple(body), caption, **options) if body else None
 
 

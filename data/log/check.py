@@ -65,8 +65,6 @@ JUMP_NIS = 1e3
 """NIS of a fix that is no noise."""
 FAR_AWAY = 3e5
 """m, from all others, where no vehicle cooperates."""
-SLOW, LEAST_WAY = 0.1, 100.0
-"""m/s, and m that nothing so slow goes in a drive."""
 LEAST_BACK = 0.02
 """Share of the way that a vehicle goes back, if it does."""
 FORWARD = "speed", "vx", "vy"
@@ -196,9 +194,6 @@ def _axes(c: Check, column: int) -> str:
             f"its fixes lie {away / 1000:.0f} km from all others: is the sign of a latitude or longitude lost, are "
             "both swapped, or is it in another frame?"
         )
-    pace = float(np.nanquantile(norm(rec.velocity[0, :, column], axis=-1), 0.9))
-    if pace < SLOW and np.ptp(pd.DataFrame(rec.gnss[0, :, column, :2]).dropna(), axis=0).max() > LEAST_WAY:
-        return f"nine tenths of the time it is slower than {pace:.2g} m/s: is t in ms (scale=t:1e-3) or finer?"
     moved, driven, *_ = moves(c, column)
     length = norm(moved)
     size = length * norm(driven)

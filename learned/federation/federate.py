@@ -14,7 +14,7 @@ from coopoc.errors import InputError
 from coopoc.plugins import find
 from coopoc.world.sensors import stream
 
-from ..nets.gain import Gain, check_net, flatten
+from ..nets.gain import Gain, flatten
 from ..training.clients import Client
 from ..training.fit import Judge, descend, pooled
 from ..training.schedule import COUNT_LIMITS, Schedule, cosine, generator, one_core, watched
@@ -143,7 +143,7 @@ def federate(
     """
     chosen_net = find("coopoc.nets", model) if isinstance(model, str) else model
     start = chosen_net() if isinstance(chosen_net, type) else chosen_net
-    check_net(start)
+    instance("model", start, Gain, "Give GainNet(), or its name.")  # type: ignore[type-abstract]
     began, plan = perf_counter(), Plan(rounds, aggregate, local_epochs, schedule, participation)
     names = _names(clients)
     plan.check(len(names))

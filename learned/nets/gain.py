@@ -23,8 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from coopoc import Method
-from coopoc.arrays import Floats, instance
-from coopoc.errors import InputError
+from coopoc.arrays import Floats
 
 from ..engine.backward import Moments, Outcome, Update, advance
 from ..method import LearnedGain
@@ -151,15 +150,6 @@ def over_time(values: Tensor, counted: Tensor) -> Tensor:
     if there.all():
         return rows.mean(-1)
     return torch.where(there, rows, 0.0).sum(-1) / there.sum(-1).clamp(min=1)
-
-
-def check_net(model: Gain) -> None:
-    """InputError for what is no net, or has a parameter that is not to be trained."""
-    instance("model", model, Gain, "Give GainNet().")  # type: ignore[type-abstract]
-    for name, parameter in model.named_parameters():
-        if not parameter.requires_grad:
-            allowed = "must be True: all parameters are trained"
-            raise InputError(f"requires_grad of {name}", False, allowed, "Keep what is fixed as a buffer.")
 
 
 def flatten(models: Sequence[nn.Module]) -> Tensor:

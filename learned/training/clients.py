@@ -99,12 +99,12 @@ class Segments:
             raise InputError("pieces", agreed, "must agree in dt and start", "Cut all clients alike.")
         if any(p.scale is not None for p in parts):
             parts = [p if p.scale is not None else replace(p, scale=torch.ones_like(p.gnss[..., :1])) for p in parts]
-        beyond, more = {"velocity": 0.0, "scale": 1.0}, [(0, 0, 0, longest - p.truth.shape[1]) for p in parts]
-        return parts[0]._each(
-            lambda name: torch.cat(
-                [pad(getattr(p, name), by, value=beyond.get(name, nan)) for p, by in zip(parts, more, strict=True)]
-            )
-        )
+        beyond = {"velocity": 0.0, "scale": 1.0}
+
+        def padded(part: Segments, name: str) -> Tensor:
+            return pad(getattr(part, name), (0, 0, 0, longest - part.truth.shape[1]), value=beyond.get(name, nan))
+
+        return parts[0]._each(lambda name: torch.cat([padded(part, name) for part in parts]))
 
     def double(self) -> "Segments":
         """The same pieces in float64."""

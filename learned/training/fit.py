@@ -16,7 +16,7 @@ from coopoc.text import short_repr
 from coopoc.world.sensors import stream
 
 from ..engine.backward import Moments, Update
-from ..nets.gain import Gain, check_net, flatten, unflatten
+from ..nets.gain import Gain, flatten, unflatten
 from ..nets.okf import NoiseParameters
 from .clients import Batch, Segments, check_segments, mirrored
 from .schedule import Schedule, cosine, generator, one_core, watched
@@ -92,7 +92,7 @@ def fit(
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
     2
     """
-    check_net(model)
+    instance("model", model, Gain, "Give GainNet().")  # type: ignore[type-abstract]
     instance("schedule", schedule, Schedule)
     check_segments("training", training)
     check_segments("validation", validation)

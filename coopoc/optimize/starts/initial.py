@@ -92,7 +92,7 @@ def crossed(problem: Problem, x: Floats) -> Floats:
         square = across[:, :, None] * across[:, None]
         np.add.at(squares, j, square)
         np.add.at(sums, j, square @ x[i, :2, None])
-    squares[stacked([*placed, *map(np.atleast_1d, (problem.poses, problem.fixed))]).astype(int)] = 0.0
+    squares[np.concatenate([*placed, problem.poses, problem.fixed]).astype(int)] = 0.0
     known = np.linalg.eigvalsh(squares)[:, 0] > PARALLEL
     x[known, :2] = np.linalg.solve(squares[known], sums[known])[..., 0]
     return x
