@@ -206,7 +206,7 @@ class Table:
                 if isinstance(mean, float) and isfinite(mean) and not (names & UNRANKED or smooths(names)):
                     lost = entry.lost if isinstance(entry, Interval) else 0
                     places.setdefault(i if self.along == "row" else j, []).append((lost, mean, i, j))
-        whole = [[each for least, *each in group if least == min(group)[0]] for group in places.values()]
+        whole = [[(mean, i, j) for least, mean, i, j in each if least == min(each)[0]] for each in places.values()]
         return [sorted(group, reverse=self.best == "max") for group in whole]
 
 
@@ -398,6 +398,6 @@ def _columns(entry: Entry, wide: bool) -> list[object]:
 def _entry(stored: Any) -> Entry:
     """An entry as JSON has it: a mapping stands for an interval."""
     if isinstance(stored, dict):
-        ends, counts = ("mean", "low", "high"), (int(stored["n"]), int(stored.get("lost", 0)))
-        return Interval(*(float(stored[end]) for end in ends), *counts)
+        mean, low, high = (float(stored[end]) for end in ("mean", "low", "high"))
+        return Interval(mean, low, high, int(stored["n"]), int(stored.get("lost", 0)))
     return stored if isinstance(stored, float | int | None) else str(stored)
