@@ -270,7 +270,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (least_squares, {"nodes": AB, "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])}),
     "solve": (lambda **given: co.solve(**given).x, {"problem": PAIR, "backend": "gauss-newton"}),
-    "incremental": (lambda **given: co.incremental(**given)[0], {"problem": PAIR, "lag": 2, "params": None}),
+    "incremental": (lambda **given: co.incremental(**given)[0], {"problem": PAIR, "params": None}),
     "pose": (co.pose, {"position": zeros((4, 2)), "turn": full(4, 0.7)}),
     "plot_recording": (partial(drawn, co.plot_recording), {"recording": SEEN, "run": 0, "step": 1}),
     "plot_track": (partial(drawn, co.plot_track), {"track": OWN, "fleet": TOWN, "every": 9}),

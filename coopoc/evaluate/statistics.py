@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import isfinite, nan
+from math import hypot, isfinite, nan
 
 import numpy as np
 
@@ -112,8 +112,9 @@ def over_seeds(values: AnyArray) -> Interval:
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
     means = values.reshape(len(values), -1).mean(1)
     mean = float(means.mean())
-    half = float(special.stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / np.sqrt(len(means)))
-    return Interval(mean, mean - half, mean + half, len(means))
+    n = len(means)
+    half = float(special.stdtrit(n - 1, 0.975) * hypot(*(means - mean)) / np.sqrt(n * (n - 1)))
+    return Interval(mean, mean - half, mean + half, n)
 
 
 @lru_cache(maxsize=2)
