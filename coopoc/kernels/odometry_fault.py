@@ -36,7 +36,7 @@ and the way m, and of their times s, and of the weights, 1 / variance m^-2; the 
 logarithm of how likely they were; and, all the time, the numbers of a MotionNoise, base and ratio squared."""
 WALK, FIRST, LATER, SHARE, RATE, STDS, DURATION, AGAIN, SIZE = range(34, 43)
 """The numbers of a pace; and 1 once the second filter has begun anew while there is evidence."""
-PACES = ((0.001, 6.0, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 18.0, 0.2, 0.5, 5.0, 2.0))
+PACES = ((0.001, 6.0, 6.0, 0.05, 0.1, 30.0, 60.0), (1.0, 0.0, 10.0, 0.2, 0.5, 5.0, 2.0))
 """Of the random walks of b: the density of its acceleration m^2/s^3; the evidence that its filter loses where it begins
 anew, and where it does so once more; and the least error of an odometry that fails, as a share of the way, in m for
 each second, and in standard deviations of a fix, MAX_WANDER_M at most, and for how many s it lasts."""
