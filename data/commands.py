@@ -12,7 +12,7 @@ from coopoc.arrays import one_of
 from coopoc.paths import replaceable, write
 
 from .fetch import Entry, fetch, public
-from .registry import DATASETS, LOGS, card, kind_of, list_datasets, load_fleet, read_log
+from .registry import DATASETS, LOGS, card, kind_of, load_fleet, read_log
 from .source import split
 
 
@@ -21,7 +21,9 @@ def list_() -> None:
 
     Example: coopoc data list
     """
-    print(tabulate(list_datasets(), headers="keys", tablefmt="github"), end="\n\n")
+    columns = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
+    cards = [[card(name)[column] for column in columns] for name in DATASETS]
+    print(tabulate(cards, columns, "github"), end="\n\n")
     rows = [
         {
             "name": name,

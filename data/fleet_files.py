@@ -1,4 +1,4 @@
-"""Readers of drives: tables, TUM trajectories, SUMO's floating-car data; a writer of tables."""
+"""Readers of drives: tables, TUM trajectories, SUMO's floating-car data."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -10,8 +10,6 @@ import pandas as pd
 
 from coopoc import Fleet, InputError
 from coopoc.formats.values import read_table as read_rows
-from coopoc.paths import write
-from coopoc.text import spreadsheet
 
 from .assemble import assemble
 from .cells import Factors, Names, factors, named_columns, numeric, read_frame, seconds, words
@@ -46,19 +44,6 @@ def read_table(path: Path, *, columns: Names | None = None, scale: Factors | Non
     )
     ids = [re.sub("^'(?=[=+@-])", "", name) for name in words(frame, "id", path.name)]  # of `spreadsheet`
     return assemble(ids, t, np.column_stack(numbers), **options, path=path, source=source)
-
-
-def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
-    """Write id, t, x, y, z and, if asked for, vx, vy, vz of every present vehicle and instant, vehicle by vehicle, to a
-    .parquet or (any other ending) CSV file; numbers come back bit by bit."""
-    frame = fleet.to_frame().rename(columns={"vehicle": "id"}).round({"t": 6})[[*NEEDED, *velocity * VELOCITY]]
-    frame = frame.sort_values("id", key=lambda ids: ids.map(fleet.ids.index), kind="stable")
-    if path.suffix.lower() != ".parquet":
-        write(path, frame.assign(id=frame["id"].map(spreadsheet)).to_csv(index=False, lineterminator="\n"))
-    else:
-        split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
-        options: dict[str, Any] = {"use_dictionary": ["id", "t"], "column_encoding": split}
-        write(path, lambda file: frame.to_parquet(file, index=False, compression="zstd", **options))
 
 
 def tum_files(path: Path) -> list[Path]:

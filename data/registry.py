@@ -187,16 +187,6 @@ def detect(path: Path, columns: Names | None = None) -> str:
     return kind
 
 
-def list_datasets() -> list[dict[str, Any]]:
-    """One row per bundled fleet: name, map, its licence, vehicles, steps, dt s, sha256.
-
-    >>> [row["name"] for row in list_datasets()][:2]
-    ['town04', 'town10']
-    """
-    columns = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
-    return [{column: card(name)[column] for column in columns} for name in DATASETS]
-
-
 def _real(path: Path, columns: Names | None = None) -> str:
     """Format of measurements, "" for anything else."""
     if (path / "Barcodes.dat").is_file():

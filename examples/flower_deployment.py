@@ -27,9 +27,9 @@ import tyro
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from make_fleet import write_table
 
 from coopoc import Fleet, load_fleet
-from coopoc.data.fleet_files import write_table
 from coopoc.learned.checkpoint import read
 
 APP = Path(__file__).parent / "flower"

@@ -23,9 +23,11 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import diags_array, eye_array
 
 from coopoc.data.assemble import backward_difference
-from coopoc.data.fleet_files import read_fcd, write_table
+from coopoc.data.fleet_files import read_fcd
 from coopoc.data.registry import DATASETS, card
 from coopoc.errors import InputError, MissingLibraryError, unknown
+from coopoc.paths import write
+from coopoc.text import spreadsheet
 from coopoc.world.fleet import Fleet
 
 Streets = dict[str, tuple[str, ...]]
@@ -130,6 +132,20 @@ def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -
     made["words"] = in_words(made)
     (out / f"{recipe.name}.json").write_text(json.dumps(made, indent=1) + "\n")
     return made
+
+
+def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
+    """Write id, t, x, y, z and, if asked for, vx, vy, vz of every present vehicle and instant, vehicle by vehicle, to a
+    .parquet or (any other ending) CSV file; numbers come back bit by bit."""
+    columns = ["id", "t", "x", "y", "z", *velocity * ("vx", "vy", "vz")]
+    frame = fleet.to_frame().rename(columns={"vehicle": "id"}).round({"t": 6})[columns]
+    frame = frame.sort_values("id", key=lambda ids: ids.map(fleet.ids.index), kind="stable")
+    if path.suffix.lower() != ".parquet":
+        write(path, frame.assign(id=frame["id"].map(spreadsheet)).to_csv(index=False, lineterminator="\n"))
+    else:
+        split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
+        options: dict[str, Any] = {"use_dictionary": ["id", "t"], "column_encoding": split}
+        write(path, lambda file: frame.to_parquet(file, index=False, compression="zstd", **options))
 
 
 def in_words(facts: dict[str, Any]) -> dict[str, str]:

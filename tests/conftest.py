@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from make_fleet import write_table
 from numpy import arange, cos, nan, pi, sin
 from numpy.random import default_rng
 from scipy import stats
 
 from coopoc import V2X, Fleet, Sensors, load_fleet, observe
 from coopoc.data.fetch import public
-from coopoc.data.fleet_files import write_table
 from coopoc.errors import InputError
 
 collect_ignore = ["fuzz"]

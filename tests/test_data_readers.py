@@ -9,6 +9,7 @@ import pandas as pd
 import pymap3d
 import pytest
 from conftest import measured, refused
+from make_fleet import write_table
 from numpy import arange, nan, zeros
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -16,7 +17,6 @@ from pyarrow.parquet import read_metadata
 
 import coopoc as co
 from coopoc.data.assemble import interpolate
-from coopoc.data.fleet_files import write_table
 from coopoc.data.registry import load_fleet
 from coopoc.errors import InputError
 from coopoc.studies.roads import road_row

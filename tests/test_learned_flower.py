@@ -15,9 +15,9 @@ import pytest
 import torch
 from conftest import refused, winding
 from logs import long, observed, write
+from make_fleet import write_table
 from shell import ROOT
 
-from coopoc.data.fleet_files import write_table
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import clients, federate, load
 from coopoc.learned.flower import client_app, rounds

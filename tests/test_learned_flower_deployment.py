@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import winding
+from make_fleet import write_table
 from shell import ROOT, ran
 from test_learned_flower import in_process
 from test_learned_flower import pytestmark as flower
 
-from coopoc.data.fleet_files import write_table
 from coopoc.learned import load
 from coopoc.learned.federation.federate import adapt
 from coopoc.learned.flower.client import job_of

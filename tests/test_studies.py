@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
+from make_fleet import write_table
 from shell import ran
 
 import coopoc as co
-from coopoc.data.fleet_files import write_table
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain

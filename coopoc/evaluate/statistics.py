@@ -43,7 +43,7 @@ def mean_interval(values: AnyArray) -> Interval:
 
     The percentiles are widened to Phi(sqrt(n/(n-1)) t_{n-1}), n = E (or R for one ego): the plain percentile interval
     is too narrow for few egos (Hesterberg, The American Statistician 69, 2015, section 4.3.2). With normal egos and
-    runs of equal variance, 95 % intervals hold the mean in 93 % of trials for 5 and 8 egos, and for one of 10 runs.
+    runs of equal variance, 95 % intervals hold the mean in 93 % of trials for 5 and 8 egos, in 94 % for one of 10 runs.
     Below LEAST_BOOTSTRAP no resample goes beyond the values: there Student's t of the n means counts where it is wider.
     Runs count as independent from ego to ego; errors that all share in a run make the interval too narrow.
 

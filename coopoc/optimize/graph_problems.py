@@ -59,8 +59,9 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     chordal: kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2, tau = d / trace(cov_t) and kappa = 1 / var_theta
     in the plane, 3 / (2 trace(cov_R)) in space: quadratic, so that it can be certified. These are the weights of CORA
     (arXiv 2302.11614), and those of SE-Sync (Rosen et al., IJRR 2019) where heading and position are not correlated;
-    else SE-Sync's kappa is the information of theta, which is larger. Covariances are those of the variances, not of
-    these weights. geodesic: R_ij^T (R_i^T (t_j - t_i) - t_ij) and log(R_ij^T R_i^T R_j) with the full covariance.
+    else SE-Sync's kappa is the information of theta, which is larger. One weight stands for all directions, in the
+    answer and in its covariance; a note says where noise differs by direction. geodesic: R_ij^T (R_i^T (t_j - t_i) -
+    t_ij) and log(R_ij^T R_i^T R_j) with the full covariance.
 
     Args:
         graph: of `coopoc.formats.load_graph`.
@@ -104,10 +105,11 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     if graph.dimension == 2 and (beyond := int((abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
         notes.append(f"relative poses beyond two turns, {beyond} in all: are angles in degrees?")
-    d, kinds = graph.dimension, MEASUREMENT_KINDS
-    size = np.linalg.eigvalsh(np.concatenate([getattr(graph, kind).covariance[:, :d, :d] for kind in kinds]))
-    if objective == "chordal" and (uneven := int((size[:, -1] > UNEVEN * size[:, 0]).sum())):
-        notes.append(f"one weight stands for noise that differs by direction, of {uneven} measurements: take geodesic")
+    if objective == "chordal":
+        d, kinds = graph.dimension, MEASUREMENT_KINDS
+        size = np.linalg.eigvalsh(np.concatenate([getattr(graph, kind).covariance[:, :d, :d] for kind in kinds]))
+        if uneven := int((size[:, -1] > UNEVEN * size[:, 0]).sum()):
+            notes.append(f"one weight stands for noise that differs by direction, of {uneven} in all: take geodesic")
     if start == "auto":
         problem = _raced(graph, problem)
     elif start == "incremental" and poses:

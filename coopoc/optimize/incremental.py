@@ -74,8 +74,7 @@ class Incremental:
         index_of_name = ChainMap(fresh, self._place)
 
         def index(node: Any) -> int:
-            known_index = index_of(node, index_of_name, every)
-            return known_index if known_index >= first else self._index(known_index)
+            return index_of(node, index_of_name, every)
 
         made = []
         for each in several(factors):
@@ -183,7 +182,7 @@ class Incremental:
 
     def __getitem__(self, node: str | int) -> Floats:
         """(ambient,) iSAM2's estimate of a node, in a time that does not grow with the others."""
-        k, space = self._index(node), self._problem.space
+        k, space = index_of(node, self._place, self.names), self._problem.space
         turned, d = k in self._poses, space.dimension
         value = getattr(self.isam, f"calculateEstimate{'Pose' if turned else 'Point'}{d}")(k)
         if not turned:
@@ -193,12 +192,9 @@ class Incremental:
 
     def marginal(self, node: str | int) -> Floats:
         """(dof, dof) m^2, rad^2 covariance of a node at iSAM2's linearisation, as `Solution.covariance` has it."""
-        k = self._index(node)
+        k = index_of(node, self._place, self.names)
         turn = tangent(self._problem.space, [k in self._poses], self[node][None])[0]
         return np.asarray(turn @ self.isam.marginalCovariance(k) @ turn.T)
-
-    def _index(self, node: str | int) -> int:
-        return index_of(node, self._place, self.names)
 
     @property
     def problem(self) -> Problem:

@@ -144,7 +144,9 @@ def measure(results: Results, metrics: Iterable[str]) -> Reference:
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
         tolerance = TRAINED_TOLERANCE if SEED in rows and rows[SEED].notna().any() else PAIRED_TOLERANCE
         for metric in metrics:
-            grid = ego_by_run(rows, metric) if metric in rows else rows.iloc[:0, :0]
+            if metric not in rows:
+                continue
+            grid = ego_by_run(rows, metric)
             each = whole(grid).to_numpy()
             if lacking(grid):
                 numbers.append(Number(where, metric, math.nan, 1, 0.0, tolerance))

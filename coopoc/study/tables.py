@@ -204,7 +204,7 @@ class Table:
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
                 if isinstance(mean, float) and isfinite(mean) and not (names & UNRANKED or smooths(names)):
-                    lost = entry.lost if isinstance(entry, Interval) else 0
+                    lost = getattr(entry, "lost", 0)
                     places.setdefault(i if self.along == "row" else j, []).append((lost, mean, i, j))
         whole = [[(mean, i, j) for least, mean, i, j in each if least == min(each)[0]] for each in places.values()]
         return [sorted(group, reverse=self.best == "max") for group in whole]

@@ -29,6 +29,7 @@ from .estimates import (
     PERHAPS,
     SURE_CLOCK_ERRORS,
     SURE_ERRORS,
+    TENTHS,
     against_truth,
     causes,
     factors,
@@ -44,7 +45,7 @@ from .frames import TOO_WIDE
 from .motion import HOLDS, LEAST_FIXES, OTHER_RATES, UNUSED_SHARE
 from .read import SEVERAL, Log
 from .relative import LEAST_OUTLIERS, OUTLIER_SHARE, measurements, misplaced, of_measurements, of_places, of_ranges
-from .residuals import Check, Row, filtered, without, without_wild
+from .residuals import Check, Row, filtered, wandered, without, without_wild
 
 WRONG_UNITS = (
     (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
@@ -223,6 +224,26 @@ def _axes(c: Check, column: int) -> str:
     return ""
 
 
+def _noisier(c: Check, column: int) -> str:
+    """When fixes scatter far more than is stated and than they do else: second differences of what they are beside the
+    odometry, which slips hardly change; nothing where none do."""
+    rec = c.world
+    path = np.cumsum(np.nan_to_num(rec.velocity[0, :, column]) * rec.dt, 0)
+    off = pd.DataFrame((rec.gnss[0, :, column] - path) / rec.fix_scale[:, column])[[0, 1]].dropna()
+    motion = np.ptp(wandered(rec, column)) / max(len(off), 1)
+    usual = np.log(2) * (6 * c.fix_noise**2 + 2 * motion)
+    size = np.hypot(*off.diff().diff().shift(-1).to_numpy().T) / usual**0.5
+    scatter = pd.Series(size).groupby(np.arange(len(off)) * TENTHS // len(off)).median()  # 1 if as stated
+    most = scatter.max()
+    if len(off) < TENTHS * LEAST_COUNT / 2 or most < CONFIDENT_RATIO * max(1.0, scatter.median()):
+        return ""
+    at = (rec.t - rec.t[0])[off.index[size > 0.5 * most]]
+    return (
+        f"its fixes scatter by {most:.2g} times their standard deviation from {at[0]:.3g} to {at[-1]:.3g} s: "
+        "did the receiver lose its base or satellites? Give columns of std, or leave these fixes out."
+    )
+
+
 def _of_rows(c: Check) -> Iterator[str]:
     """Measurements and columns that were left out."""
     summary = c.log.summary
@@ -253,8 +274,8 @@ def _of_filters(c: Check, named: Sequence[str]) -> Iterator[str]:
         if row["misses"] == "filter errs" or row["vehicle"] not in explained:
             yield (
                 f"{row['vehicle']}: its {row['misses']} by up to {row['per_std']:.1f} times its standard deviation "
-                f"from {row['worst_from_s']:.3g} to {row['worst_to_s']:.3g} s: see the other lines. Else a receiver "
-                "has lost its base or satellites, or the noise that is stated or assumed is wrong."
+                f"from {row['worst_from_s']:.3g} to {row['worst_to_s']:.3g} s: see the other lines, or the noise "
+                "that is stated or assumed is wrong."
             )
     usual = pd.Series(c.normalised.ravel()).median() < CONFIDENT_RATIO  # else the noise is understated throughout
     if usual and len(rows) == len(c.vehicles) > 1 and np.ptp(begins) < 0.2 * np.ptp(c.world.t):
@@ -279,8 +300,7 @@ def _of_vehicle(c: Check, row: Row) -> list[str]:
             "which a filter without a gate follows."
         )
     axes = _axes(c, column)
-    if axes:
-        say(f"{name}: {axes}")
+    sentences += [f"{name}: {sentence}" for sentence in (_noisier(c, column), axes) if sentence]
     if axes or any(what.startswith(FAULTS[-1]) and name in who for what, who in c.log.summary.assumed.items()):
         return sentences
     if _beyond(row, "fixes_late_s", BEHIND):

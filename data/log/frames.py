@@ -114,7 +114,7 @@ def of_clock_face(t: "pd.Series[float]") -> "pd.Series[float]":
     return 3600.0 * (t // 10000) + 60.0 * (t // 100 % 100) + t % 100
 
 
-def on_one_clock(rows: Rows, clock: Factors) -> Rows:
+def on_one_clock(rows: Rows, clock: Factors | None) -> Rows:
     """Rows with stamps, in whole microseconds, less the s that each vehicle's clock is ahead; those without a time, of
     places, at the first instant.
 

@@ -266,7 +266,7 @@ def read_log(
     measured = rows["true"] == 0
     summary.rows = int(measured.sum())
     summary.logged = rows.groupby("vehicle")["kind"].unique().to_dict()
-    rows, true_rows = on_one_clock(not_vague(rows[measured], summary), clock or {}), rows[~measured]
+    rows, true_rows = on_one_clock(not_vague(rows[measured], summary), clock), rows[~measured]
     check_one_drive(rows, path.name)
     rows, origin = local(rows, origin, summary)
     alone = rows[in_group(rows, "fix", "odometry", "heading")]

@@ -144,6 +144,12 @@ def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...] | None, str]:
         return poses, TRUE_POSE_STD, ", from the truth's first poses"
 
 
+def wandered(recording: Recording, column: int) -> Floats:
+    """(T,) m^2, by which its motions are uncertain until each step, as velocities are that fixes have shown."""
+    least = (recording.dt * recording.sensors.velocity_floor) ** 2
+    return np.cumsum(recording.motion_extra[:, column, 0] + least)
+
+
 def without_wild(c: Check) -> Check:
     """The same, less the fixes that are wild, of vehicles whose odometry does not fail."""
     size, rec = dimensions(c.world), c.log.recording
@@ -154,8 +160,7 @@ def without_wild(c: Check) -> Check:
         at = np.flatnonzero(np.isfinite(c.fix[:, column, 0]))
         gap, off = plane(c.fix[at, column]), wild[at, column]
         wild[at[:-1], column] &= ~(off[1:] & ((gap[:-1] * gap[1:].conj()).real > 0))
-        uncertain = np.cumsum(rec.motion_extra[:, column, 0] + (rec.dt * rec.sensors.velocity_floor) ** 2)  # of motions
-        unsure = np.diff(uncertain[at]) + c.shown(column) * (ACCELERATION * np.diff(rec.t[at]) ** 2) ** 2
+        unsure = np.diff(wandered(rec, column)[at]) + c.shown(column) * (ACCELERATION * np.diff(rec.t[at]) ** 2) ** 2
         wild[at[:-1], column] &= unsure < 0.5 * abs(gap[:-1]) ** 2
     if not wild.any():
         return c

@@ -94,12 +94,12 @@ class Segments:
         >>> Segments.join(each).truth[0, :, 0], Segments.join(each).velocity[0, :, 0]
         (tensor([1., 1., nan, nan]), tensor([1., 1., 0., 0.]))
         """
-        agreed, longest = {(p.dt, p.true_start) for p in parts}, max((p.truth.shape[1] for p in parts), default=0)
+        agreed = {(p.dt, p.true_start) for p in parts}
         if len(agreed) != 1:
             raise InputError("pieces", agreed, "must agree in dt and start", "Cut all clients alike.")
         if any(p.scale is not None for p in parts):
             parts = [p if p.scale is not None else replace(p, scale=torch.ones_like(p.gnss[..., :1])) for p in parts]
-        beyond = {"velocity": 0.0, "scale": 1.0}
+        beyond, longest = {"velocity": 0.0, "scale": 1.0}, max(p.truth.shape[1] for p in parts)
 
         def padded(part: Segments, name: str) -> Tensor:
             return pad(getattr(part, name), (0, 0, 0, longest - part.truth.shape[1]), value=beyond.get(name, nan))

@@ -173,7 +173,7 @@ def scattered(problem: Problem, x: Floats, loose: Ints | None = None) -> Iterato
     spread = 2.0 * np.median(np.linalg.norm(at - center, axis=1)) or 1.0
     fixes = [f.z[f.informative, :d] for f in problem.factors if f.kind in ("position", "pose", "pose_chordal")]
     known = np.concatenate([*fixes, at[list(problem.fixed)]])
-    if len(known) > 1 and (extent := 0.5 * np.linalg.norm(np.ptp(known, axis=0))) > 0.0:
+    if len(known) and (extent := 0.5 * np.linalg.norm(np.ptp(known, axis=0))) > 0.0:
         spread, center = np.clip(spread, extent, 4.0 * extent), np.median(known, axis=0)
     normal = np.linalg.svd(at - at.mean(0), full_matrices=False)[2][-1]
     sure = problem.replace_unchecked(factors=tuple(f for f in problem.factors if f.loss is None))
