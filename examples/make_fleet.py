@@ -122,7 +122,7 @@ def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -
     if not isinstance(recipe, Recipe):
         if recipe not in DATASETS:
             raise unknown("recipe", recipe, DATASETS, "Or build a Recipe of your own, in Python.")
-        command, recipe = f"python examples/make_fleet.py {recipe} --maps {map_folder}", bundled_recipe(recipe)
+        command, recipe = f"python examples/make_fleet.py {recipe} --maps FOLDER", bundled_recipe(recipe)
     fleet, out = simulate(recipe, Path(map_folder)), Path(out_folder)
     out.mkdir(parents=True, exist_ok=True)
     write_table(fleet, out / f"{recipe.name}.parquet", velocity=False)
