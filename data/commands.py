@@ -25,16 +25,10 @@ def list_() -> None:
     cards = [[card(name)[column] for column in columns] for name in DATASETS]
     print(tabulate(cards, columns, "github"), end="\n\n")
     rows = [
-        {
-            "name": name,
-            "fetched": "yes" if entry.fetched else "no",
-            "MB": round(entry.bytes / 1e6, 2),
-            "licence": entry.licence,
-            "what": entry.what,
-        }
+        (name, "yes" if entry.fetched else "no", round(entry.bytes / 1e6, 2), entry.licence, entry.what)
         for name, entry in public().items()
     ]
-    print(tabulate(rows, headers="keys", tablefmt="github"))
+    print(tabulate(rows, ("name", "fetched", "MB", "licence", "what"), "github"))
 
 
 def get(names: tyro.conf.Positional[tuple[str, ...]], /) -> None:
@@ -71,26 +65,23 @@ def show(name: tyro.conf.Positional[str]) -> None:
         if log.truth is None:
             return
     fleet = load_fleet(name)
-    _print(repr(fleet), {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"})
+    _print(repr(fleet), {of: getattr(fleet, of) or "(not stated)" for of in ("source", "licence")})
 
 
 def _fields(entry: Entry) -> dict[str, str]:
     """What a reader has to know of a public data set, to fetch it by hand, too."""
-    stated = {
-        field: getattr(entry, field)
-        for field in ("what", "licence", "citation", "page", "archive")
-        if getattr(entry, field)
-    }
+    named = "what", "licence", "citation", "page", "archive"
+    stated = {field: text for field, text in entry._asdict().items() if text and field in named}
     files = {
         f"{file}, {size:,} bytes": f"{address} {digest}".strip()
         for file, (address, size, digest) in entry.files.items()
     }
-    how = entry.by_hand or f"no: coopoc data get {entry.name}"
-    return stated | {"addresses": entry.tried} | {"fetched": str(entry.path) if entry.fetched else how} | files
+    fetched = str(entry.path) if entry.fetched else f"no: coopoc data get {entry.name}"
+    return stated | {"addresses": entry.tried, "fetched": fetched} | files
 
 
 def _print(name: str, fields: dict[str, str]) -> None:
-    print("\n".join([name, *(f"  {key:<12} {value}" for key, value in fields.items())]))
+    print(name, *(f"  {key:<12} {value}" for key, value in fields.items()), sep="\n")
 
 
 def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> None:

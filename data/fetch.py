@@ -35,7 +35,6 @@ class Entry(NamedTuple):
         files: path below the folder of the name -> (address, bytes, SHA-256).
         archive: address of a ZIP archive with all files, "" if each has its own.
         opens: what `fetch` returns, below the folder of the name.
-        by_hand: what to do where no address serves the files, which then have no hashes either.
     """
 
     name: str
@@ -47,7 +46,6 @@ class Entry(NamedTuple):
     files: Mapping[str, tuple[str, int, str]]
     archive: str = ""
     opens: str = ""
-    by_hand: str = ""
 
     @property
     def folder(self) -> Path:
@@ -67,7 +65,7 @@ class Entry(NamedTuple):
     @property
     def fetched(self) -> bool:
         """Whether every file is there with its bytes."""
-        return not self.by_hand and not self.absent()
+        return not self.absent()
 
     def absent(self) -> list[str]:
         """Files that are not there, or with other bytes."""
@@ -75,7 +73,7 @@ class Entry(NamedTuple):
 
     def address(self, file: str) -> str:
         """Where a file is served; below a mirror as it lies in the folder of all data."""
-        mirror = os.environ.get("COOPOC_MIRROR", "")
+        mirror = os.environ.get("COOPOC_MIRROR")
         return f"{mirror.rstrip('/')}/{quote(f'{self.name}/{file}')}" if mirror else self.archive or self.files[file][0]
 
 
@@ -91,10 +89,8 @@ def public() -> Mapping[str, Entry]:
 
 
 def _entry(name: str, files: Mapping[str, Mapping[str, Any]], base: str = "", **fields: str) -> Entry:
-    entry = {
-        file: (urljoin(base, row["from"]) if base else "", row["bytes"], row["sha256"]) for file, row in files.items()
-    }
-    return Entry(name, files=entry, **fields)
+    rows = {file: (urljoin(base, row.get("from", "")), row["bytes"], row["sha256"]) for file, row in files.items()}
+    return Entry(name, files=rows, **fields)
 
 
 def cache_folder() -> Path:
@@ -161,8 +157,6 @@ def fetch(name: str) -> Path:
     entry = public().get(name) if isinstance(name, str) else None
     if entry is None:
         raise unknown("data", name, public())
-    if entry.by_hand:
-        raise InputError("data", repr(name), f"is served by {entry.page} alone, to its users", entry.by_hand)
     from filelock import FileLock
 
     if not entry.fetched:

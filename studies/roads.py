@@ -194,9 +194,9 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     track = method(recording, egos)
     gap, nees = planar(track, fleet)
     size = min(BLOCK_SECONDS, len(recording.t) * recording.dt / MIN_BLOCKS) / recording.dt
-    blocks = blocks_of(np.sqrt(np.vecdot(gap, gap).mean(0)), 0, size)
+    blocks = blocks_of(np.sqrt(np.vecdot(gap, gap).mean(0)), 0, size).T
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
-    row |= {"rt_le_m": rounded(blocks.T), "blocks_m": blocks.ravel().round(4).tolist()}
+    row |= {"rt_le_m": rounded(blocks), "blocks_m": blocks.round(4).tolist()}
     if track.covariance is not None:
         row["nees"] = round(np.nanmean(nees), 2)
     return row | costs(track, recording, method)

@@ -233,17 +233,15 @@ def test_the_registry_is_complete_and_pins_every_address(cache, capsys):
     assert "coopoc data get f9k" in told
 
 
-def test_what_no_address_serves_says_how_it_is_read(tmp_path):
-    """The paper's drives: the options of the message read a table with CARLA's axes under other names."""
-    with refused(r"carla-60' *: is served by https://dx\.doi\.org/10\.21227/511y.*\?columns=.*&scale=y:-1,vy:-1"):
-        co.fetch("carla-60")
+def test_drives_with_carlas_axes_under_other_names_are_read(tmp_path):
+    """As those of the paper, which are behind a login."""
     rows = [f"{car},{t / 10},{t},{t - car},0,8,2,0" for t in range(5) for car in range(60)]
     (tmp_path / "a.csv").write_text("\n".join(["car,time,px,py,pz,u,v,w", *rows]))
     fleet = co.load_fleet(f"{tmp_path}/a.csv?columns=id:car,t:time,x:px,y:py,z:pz,vx:u,vy:v,vz:w&scale=y:-1,vy:-1")
     assert fleet.position[2, fleet.index("7")].tolist() == [2, 5, 0]
 
 
-@pytest.mark.parametrize("name", [name for name, one in public().items() if one.files])
+@pytest.mark.parametrize("name", public())
 def test_the_registry_has_the_hashes_of_what_the_pages_were_computed_from(name, cache, tmp_path, monkeypatch):
     """Through a mirror made of the files; what it returns is read by the commands that take it."""
     for file in public()[name].files:

@@ -2,6 +2,7 @@
 GTSAM's; and real graphs that GTSAM brings."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import gtsam
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import DIMENSIONS, measured, refused
 from hard_graphs import cropped
-from numpy import array, eye, flatnonzero
+from numpy import arange, array, eye, flatnonzero
 from numpy.linalg import eigvalsh, norm
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import moved, random_drive, random_graph, scipys
@@ -165,7 +166,7 @@ def test_marginals_of_a_chain_in_the_plane_are_those_of_its_noise(objective, tmp
 
 def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_bayes_tree():
     """A graph with a constraint is not evaluated by tapes, and too large here for a dense inverse."""
-    problem = from_graph(random_graph(215, 2, steps=110))
+    problem = from_graph(random_graph(215, 2, steps=310))
     x = solve(problem).x
     first, last = problem.names[0], problem.names[-1]
     found = assess(problem.constrain("range", (first, last), upper=1e6), x)
@@ -323,6 +324,15 @@ def test_a_weak_measurement_is_no_free_node(weight):
     assert set(apart.unobservable) == {f"A{k}" for k in range(50, 100)}
     ways = array([[1.0, 1.0], [1.0, 1.0 + 1e-6]])
     assert all(_seen(csc_array([[1.0, -1.0]]), unit * ways).tolist() == [False, True] for unit in (1.0, 1e-4))
+
+
+def test_covariances_of_a_chain_behind_a_vague_prior_keep_their_digits():
+    """Closed form: variances add up; J^T J has a condition of 1e14."""
+    names = [f"v{k}" for k in range(200)]
+    problem = Problem(names).add("position", "v0", [9.0, 0, 0], std=1e5)
+    links = list(pairwise(names))
+    found = solve(problem.add("displacement", links, [[1.0, 2, 0]] * len(links), std=0.01))
+    assert found.covariance[:, 0, 0] == pytest.approx(1e10 + 1e-4 * arange(200), rel=1e-9)
 
 
 @pytest.mark.parametrize("unseen", [1, 40])

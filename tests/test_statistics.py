@@ -36,12 +36,17 @@ def test_pairing_cancels_what_both_share():
     assert apart.high - apart.low > 10 * (difference.high - difference.low)
 
 
-@pytest.mark.parametrize(("egos", "runs", "between", "low"), [(1, 40, 0.0, 0.90), (8, 20, 1.0, 0.88)])
-def test_intervals_hold_the_mean_as_often_as_they_promise(egos, runs, between, low):
+@pytest.mark.parametrize(
+    ("egos", "runs", "between", "together", "low"),
+    [(1, 40, 0.0, 0.0, 0.90), (8, 20, 1.0, 0.0, 0.88), (20, 10, 0.2, 1.0, 0.92), (6, 6, 1.0, 1.0, 0.92)],
+)
+def test_intervals_hold_the_mean_as_often_as_they_promise(egos, runs, between, together, low):
+    """`together`: errors that egos share in a run."""
     rng = default_rng(4)
     hits = 0
     for _ in range(300):
-        found = mean_interval(between * rng.normal(size=egos) + rng.normal(size=(runs, egos)))
+        of_run = together * rng.normal(size=(runs, 1)) if together else 0.0
+        found = mean_interval(between * rng.normal(size=egos) + of_run + rng.normal(size=(runs, egos)))
         hits += found.low <= 0 <= found.high
     assert low < hits / 300 < 0.98
 

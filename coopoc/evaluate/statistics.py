@@ -42,10 +42,10 @@ def mean_interval(values: AnyArray) -> Interval:
     """Mean over E egos and R runs with the 95 % interval of a bootstrap over egos, then over the runs of each.
 
     The percentiles are widened to Phi(sqrt(n/(n-1)) t_{n-1}), n = E (or R for one ego): the plain percentile interval
-    is too narrow for few egos (Hesterberg, The American Statistician 69, 2015, section 4.3.2). With normal egos and
-    runs of equal variance, 95 % intervals hold the mean in 93 % of trials for 5 and 8 egos, in 94 % for one of 10 runs.
+    is too narrow for few egos (Hesterberg, The American Statistician 69, 2015, section 4.3.2). They
+    hold the mean of normal values in 93 to 99 % of trials.
     Below LEAST_BOOTSTRAP no resample goes beyond the values: there Student's t of the n means counts where it is wider.
-    Runs count as independent from ego to ego; errors that all share in a run make the interval too narrow.
+    Where runs differ by more than chance (F test, 5 %), as if egos shared errors, Student's t of their means is added.
 
     Args:
         values: (R, E) or (R,) of one metric, runs first, as `rt_le` and `nees` give them.
@@ -59,18 +59,25 @@ def mean_interval(values: AnyArray) -> Interval:
     1.5 [-4.85, 7.85]
     """
     values = _checked("values", values)
-    mean, n = float(values.mean()), len(values) if len(values) > 1 else values.shape[1]
+    mean, (egos, runs) = float(values.mean()), values.shape
+    n = egos if egos > 1 else runs
     if n < 2:
         return Interval(mean, nan, nan, values.size)
     from scipy import special  # a fifth of a second, which a mistake on the command line need not wait for
 
-    counts, step = _counts(*values.shape, RESAMPLES), max(1, _CHUNK // values.size)
-    sums = [counts[k : k + step].astype(float) @ values.ravel() for k in range(0, RESAMPLES, step)]
-    share = special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, 0.025))
-    low, high = np.quantile(np.concatenate(sums) / values.size, [share, 1 - share])
+    counts, step = _counts(egos, runs), max(1, _CHUNK // values.size)
+    means = [counts[k : k + step].astype(float) @ values.ravel() / values.size for k in range(0, RESAMPLES, step)]
+    share = special.ndtr((n / (n - 1)) ** 0.5 * special.stdtrit(n - 1, 0.025))
+    low, high = np.quantile(np.hstack(means), [share, 1 - share])
     if n < LEAST_BOOTSTRAP:
-        wide = over_seeds(values.mean(1) if len(values) > 1 else values[0])
+        wide = over_seeds(values if egos > 1 else values[0])
         low, high = min(low, wide.low), max(high, wide.high)
+    shared = values.mean(0) - mean
+    own = hypot(*(values - values.mean(1)[:, None] - shared).flat)
+    chance = special.fdtri(runs - 1, (egos - 1) * (runs - 1), 0.95)  # NaN of one ego or run
+    if hypot(*shared) > own * (chance / (egos * (egos - 1))) ** 0.5:
+        half = over_seeds(values.T).high - mean
+        low, high = mean - hypot(mean - low, half), mean + hypot(high - mean, half)
     return Interval(mean, float(low), float(high), values.size)
 
 
@@ -108,25 +115,25 @@ def over_seeds(values: AnyArray) -> Interval:
     from scipy import special
 
     values = checked("values", values)
-    if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
+    if not values.ndim or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
     means = values.reshape(len(values), -1).mean(1)
     mean = float(means.mean())
     n = len(means)
-    half = float(special.stdtrit(n - 1, 0.975) * hypot(*(means - mean)) / np.sqrt(n * (n - 1)))
+    half = special.stdtrit(n - 1, 0.975) * hypot(*(means - mean)) / (n * (n - 1)) ** 0.5
     return Interval(mean, mean - half, mean + half, n)
 
 
 @lru_cache(maxsize=2)
-def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
-    """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each; the same draws for any
+def _counts(egos: int, runs: int) -> AnyArray:
+    """(RESAMPLES, egos x runs) how often each value is drawn: egos, then the runs of each; the same draws for any
     values of one shape, so pairs stay pairs."""
     size, rng = egos * runs, np.random.default_rng(0)
-    counts = np.empty((resamples, size), np.uint16 if size < 2**16 else np.uint32)
+    counts = np.empty((RESAMPLES, size), np.uint16)
     step = max(1, _CHUNK // size)
-    for start in range(0, resamples, step):
-        count = min(step, resamples - start)
-        ego = rng.integers(egos, size=(count, egos, 1)) if egos > 1 else np.zeros((count, 1, 1), int)
+    for start in range(0, RESAMPLES, step):
+        count = min(step, RESAMPLES - start)
+        ego = rng.integers(egos, size=(count, egos, 1))
         run = rng.integers(runs, size=(count, egos, runs))
         index = (np.arange(count)[:, None, None] * egos + ego) * runs + run
         counts[start : start + count] = np.bincount(index.ravel(), minlength=count * size).reshape(count, size)
@@ -136,7 +143,7 @@ def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
 def _checked(name: str, values: AnyArray) -> Floats:
     """(E, R), egos first."""
     array = np.atleast_2d(checked(name, values).T)
-    if array.ndim != 2 or array.size == 0:
+    if array.ndim != 2 or not array.size:
         raise InputError(name, array.T.shape, "must have shape (R, E) or (R,)", "Runs first, then egos.")
     refuse(name, array.T, ~np.isfinite(array.T), "must be finite", "Leave out failed cells before you average.")
     return array

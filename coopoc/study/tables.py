@@ -189,7 +189,7 @@ class Table:
         for group in self.ranked():
             best = group[0][0]
             same = [(i, j) for n, i, j in group if abs(n - best) <= EQUAL_SHARE * abs(best) or (i, j) in self.alike]
-            if len(same) <= max(2, len(group) / 2) and len(same) < len(group):  # what three and most have is none
+            if len(same) < len(group):
                 bold |= {*same}
         return bold
 

@@ -28,7 +28,7 @@ CANCELLED = 1e-7
 """Share of its terms that a row may keep along a direction that it does not see."""
 ROUNDED = 1e-14
 """Share of the largest number of a column up to which another is rounding, such as sin(0)."""
-DENSE_COLUMNS = 200
+DENSE_COLUMNS = 600
 """Columns up to which the null space of J is that of a dense matrix."""
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
