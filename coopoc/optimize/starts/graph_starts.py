@@ -148,11 +148,10 @@ def tree(graph: Graph) -> Floats:
     elif len(edges):  # angles add, so that one solve is exact
         turns, _ = averaging(edges.nodes, variance, len(rotation), held)
         rotation = exp(turns(log(rotation[j] @ (rotation[i] @ edges.rotation).mT))) @ rotation
-    kinds = edges, graph.relative_point
-    at = with_points(graph, position, rotation, reached)[:, :d]
-    (i, j), moved = np.concatenate([each.nodes for each in kinds]).T, np.concatenate([each.position for each in kinds])
-    variance = np.concatenate([position_variance(each, d) for each in kinds])
-    places, _ = averaging(np.column_stack([i, j]), variance, len(at), held)
+    every = ((each.nodes, each.position, position_variance(each, d)) for each in (edges, graph.relative_point))
+    nodes, moved, variance = map(np.concatenate, zip(*every, strict=True))
+    at, (i, j) = with_points(graph, position, rotation, reached)[:, :d], nodes.T
+    places, _ = averaging(nodes, variance, len(at), held)
     at, still = at + places(at[j] - at[i] - (rotation[i] @ moved[..., None])[..., 0]), anchors(graph)
     at[still] = graph.position[still]
     return Space(d, has_rotation=True).join(at, rotation)
