@@ -169,13 +169,14 @@ def heading_of_rates(way: Reckoning, gap: float) -> tuple[Course | None, float]:
         return None, factor
     at = while_sampled(heading_until(Signal(t, heading[:, None]), rate), rate.t, gap)
     noise, square = way.std**2 * way.fixes.interval, Signal(t, variance)
-
-    def of_pace(times: Floats) -> Floats:
-        rise: Floats = np.nan_to_num(4.0 * noise * held(square, times) ** 2) ** (1 / 3)
-        return rise
-
     usual = float(np.median(variance[known]))  # of a steady filter, whose error has this time constant
-    return Course(at, "fixes", of_pace=of_pace, unsure=usual**0.5, lasts=usual / way.walk**2), factor
+    return Course(
+        at,
+        "fixes",
+        of_pace=lambda times: np.nan_to_num(4.0 * noise * held(square, times) ** 2) ** (1 / 3),
+        unsure=usual**0.5,
+        lasts=usual / way.walk**2,
+    ), factor
 
 
 def poses_of(way: Reckoning) -> tuple[Floats, Floats, Floats, Floats]:
