@@ -78,8 +78,7 @@ def plot_track(
     >>> len(plot_track(co.Kalman()(co.observe(fleet, co.Sensors())), fleet=fleet).lines)
     2
     """
-    last = len(instance("track", track, Track).x) - 1
-    run = whole("run", run, 0, last)
+    run = whole("run", run, 0, len(instance("track", track, Track).x) - 1)
     every = whole("every", max(len(track.t) // 40, 1) if every is None else every, 1)
     if fleet is not None:
         same_drive(instance("fleet", fleet, Fleet), (track.ids or fleet.ids)[: len(fleet.ids)], track.t)

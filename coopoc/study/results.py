@@ -182,8 +182,7 @@ def ego_by_run(frame: DataFrame, value: str) -> DataFrame:
     """
     keys = frame.reindex(columns=["ego", "run"])
     keys = keys.astype(object).where(keys.notna(), 0)
-    values = frame[value].astype(float)
-    cells = values.groupby([keys["ego"], keys["run"]])
+    cells = frame[value].astype(float).groupby([keys["ego"], keys["run"]])
     return cells.mean().where(cells.count() == cells.size()).unstack("run")
 
 

@@ -44,8 +44,7 @@ def linked(rows: Rows, members: Members, steps: Steps, mutual: bool) -> tuple[Li
     summary, sent = steps.summary, only(rows, "message")
     measured = _measured(rows, members, there, steps)
     if mutual:
-        stands = stacked(members, "stands")
-        far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
+        far = measured[(measured["component"] == 0) & ~stacked(members, "stands")[measured["neighbour"]]]
         aimed = measured[measured["component"] == 1]
         reached = far.set_index(LINK_COLUMNS).index.isin(aimed.set_index(LINK_COLUMNS).index)
         if reached.any():

@@ -81,8 +81,7 @@ def _read_text(file: Path, summary: Summary, **_: Any) -> Rows:
     if is_nmea(file):
         return read_nmea(file, summary)
     lines, table = read_rows(file, "t x y z qx qy qz qw")
-    frame = pd.DataFrame(table[:, :4], lines, [*"txyz"])
-    return of_kinds(frame.assign(vehicle=file.stem), file.name)
+    return of_kinds(pd.DataFrame(table[:, :4], lines, [*"txyz"]).assign(vehicle=file.stem), file.name)
 
 
 READERS: Mapping[str, Callable[..., Rows]] = {

@@ -294,8 +294,7 @@ def _checked(item: "Factor | Constraint") -> Measurement:
     if constants.shape not in ((own,), (1, own), (count, own)) or not isfinite(constants).all():
         hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
         raise InputError("constants", constants.tolist(), f"must be {own} finite numbers for {measurement.name}", hint)
-    wide = frozen(np.full((count, own), constants))
-    item.__dict__.update(kind=measurement.name, nodes=nodes, constants=wide)
+    item.__dict__.update(kind=measurement.name, nodes=nodes, constants=frozen(np.full((count, own), constants)))
     return measurement
 
 
