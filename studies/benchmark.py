@@ -45,7 +45,7 @@ def benchmark(
     validation: bool = False,
     seed: int | None = None,
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK")] = (),
-    worlds: int = 0,
+    worlds: int | None = None,
     jobs: int = 1,
     table: bool = False,
 ) -> int:
@@ -74,9 +74,9 @@ def benchmark(
         jobs: processes that run worlds.
         table: print the table of all cards in the folder, best first.
     """
-    if not methods and (worlds or not table):
+    if not methods and not (table and worlds is None):
         raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
-    if worlds:
+    if worlds is not None:
         if tasks or data:
             allowed = "must stand without --tasks and --data"
             raise InputError("worlds", worlds, allowed, "Run worlds and tasks one after the other.")

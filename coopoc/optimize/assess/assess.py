@@ -28,8 +28,10 @@ CANCELLED = 1e-7
 """Share of its terms that a row may keep along a direction that it does not see."""
 ROUNDED = 1e-14
 """Share of the largest number of a column up to which another is rounding, such as sin(0)."""
-DENSE_COLUMNS = 600
+DENSE_COLUMNS = 200
 """Columns up to which the null space of J is that of a dense matrix."""
+DENSE_WORK = 4e9
+"""Rows by columns squared up to which marginals are of the R of J: a second."""
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
 rounding."""
@@ -143,7 +145,7 @@ def _unconstrained(problem: Problem, x: Floats, covariance: bool, quick: bool = 
         bent = _symmetric(entries, exact), np.sqrt(scale), flat
     if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
         return unknown._replace(unobservable=nodes)
-    if entries.size <= DENSE_COLUMNS and (half := _by_rows(problem, x)) is not None:
+    if (half := _by_rows(problem, x)) is not None:
         free, rows, columns = entries.marginals
         cov[free] = np.vecdot(half[rows], half[columns])
     if bent is None:
@@ -178,14 +180,17 @@ def _inverse(problem: Problem, x: Floats, model: Model) -> tuple[Floats, Floats]
 
 def _by_rows(problem: Problem, x: Floats) -> Floats | None:
     """H (m, m) with H H^T = (J^T J)^-1 by R of J = Q R, rows of large numbers first and columns pivoted, which keeps
-    digits that J^T J rounds away; None where J is singular.
+    digits that J^T J rounds away; None where J is singular, or its work beyond DENSE_WORK.
 
     References:
         Cox, Higham, Stability of Householder QR factorization for weighted least squares problems, 1998.
     """
     from scipy.linalg import inv, qr
 
-    J = as_stated(problem).whiten(x)[1].toarray()[:, problem.movable.ravel()]
+    J = as_stated(problem).whiten(x)[1][:, problem.movable.ravel()]
+    if J.shape[0] * J.shape[1] ** 2 > DENSE_WORK:
+        return None
+    J = J.toarray()
     upper, pivot = qr(J[np.argsort(-abs(J).max(1))], mode="r", pivoting=True)
     own = abs(upper.diagonal())
     singular = len(own) < J.shape[1] or own.min() <= ROUNDED * own.max()
@@ -537,7 +542,7 @@ def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str
     wanted = system.entries.number[places].ravel()
     unit = (np.arange(system.size)[:, None] == wanted).astype(float)
     solved = system.cholesky.solve(unit) if places else unit
-    if not truth.curved and system.size <= DENSE_COLUMNS and (half := _by_rows(problem, x)) is not None:
+    if not truth.curved and (half := _by_rows(problem, x)) is not None:
         solved = half @ (half.T @ unit)
     whole = np.pad(solved, ((0, 1), (0, 0)))[wanted]  # the last row for what cannot move
     return whole.reshape(len(places), dof, len(places), dof).swapaxes(1, 2)
